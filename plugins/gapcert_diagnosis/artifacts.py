@@ -9,11 +9,9 @@ from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
-import numpy as np
+from gapcert.plugin import Answer, Arguments, UsageError, damage_told, read, write_atomic
 
-from gapcert.plugin import Answer, Arguments, UsageError, damage_told, write_atomic
-
-from .results import Diagnosis, Experiment
+from .results import Diagnosis
 
 EXTENDED, SIGNAL = "extended.yaml", "experiment.csv"
 
@@ -29,7 +27,7 @@ def left_behind(name: str, found: Diagnosis, folder: Path) -> dict[str, Any]:
             write_atomic(folder / file, content.encode())
             out.setdefault("files", []).append(str(folder / file))
     if found.design is not None:
-        write_atomic(folder / SIGNAL, signal_text(found.design).encode())
+        write_atomic(folder / SIGNAL, found.design.csv().encode())
         out["experiment_file"] = str(folder / SIGNAL)
     return out
 
@@ -52,21 +50,11 @@ def spec_text(name: str, found: Diagnosis) -> str:
     return "".join(f"# {line}".rstrip() + "\n" for line in said) + text.getvalue()
 
 
-def signal_text(design: Experiment) -> str:
-    """The input to play as CSV: t in s, and the inputs in the model's units."""
-    text = io.StringIO()
-    columns = np.column_stack([design.t, *design.inputs.values()])
-    np.savetxt(text, columns, fmt="%.9g", delimiter=",", header=",".join(["t", *design.inputs]), comments="")
-    return text.getvalue()
-
-
 def extended_spec(run: Path) -> tuple[str, Mapping[str, Any]]:
     """The extended model of a finished run: the text of its spec, and its data with the equations.
 
     UsageError where the folder has none.
     """
-    from gapcert.plugin import read
-
     file, told = run / EXTENDED, run / "summary.json"
     if not told.is_file():
         raise UsageError(f"{run}: there is no summary.json; expected the folder of a finished run; run the spec again")
@@ -81,19 +69,14 @@ def extended_spec(run: Path) -> tuple[str, Mapping[str, Any]]:
     return file.read_text(encoding="utf-8"), {"spec": tree.data, "equations": summary.get("equations", "")}
 
 
-def write_extended(text: str, path: Path) -> Path:
-    """UsageError where the file cannot be written."""
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be written ({error.strerror}); choose another file with -o") from None
-    return path
-
-
 def command(options: Arguments) -> Answer:
     """`gapcert extend`."""
     text, data = extended_spec(Path(options.run))
     if options.output is None:
         return Answer(data, [text.rstrip()])
-    path = str(write_extended(text, options.output))
-    return Answer({"extended": path, **data}, [path])
+    path = Path(options.output)
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written ({error.strerror}); choose another file with -o") from None
+    return Answer({"extended": str(path), **data}, [str(path)])

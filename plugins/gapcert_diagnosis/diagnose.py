@@ -3,31 +3,29 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, final
 
 import numpy as np
 
-from gapcert.plugin import BEAT, Effect, Emit, Event, Model, Recording, UsageError, silent
-from gapcert_engines import NativeModel
+from gapcert.plugin import Effect, Emit, Event, Model, Recording, UsageError, registry, silent
 from gapcert_recordings import JITTER, repairs
 
 from .data import time_units as clocks
 from .data.dataset import FEWEST as SHORTEST
-from .data.dataset import Dataset
+from .data.dataset import Dataset, Windows
 from .data.joint_limits import kept_within
 from .experiment.design import Limits, told_apart
 from .figure import figure
 from .fitting.fit import Fit, fit
 from .fitting.rollout_error import Stretches, stretches
 from .fitting.step_size import coarse
-from .native.driver import diagnose_native
+from .problem import Clock, DiagnosisProblem
 from .residual import unexplained as leftover
 from .residual.tests import evidence
-from .results import Cause, Diagnosis, Estimate, Experiment, Gain, Misfit, Rival, Verdict
+from .results import Cause, Diagnosis, Estimate, Misfit, Rival
 from .search.alternatives import Answer, answered, flags, smallest
 from .search.candidates import Candidate, Causes, Library
 from .search.criterion import TIE, keys, values
@@ -55,64 +53,108 @@ def diagnose(
 ) -> Diagnosis:
     """The causes of the difference between a model and a recording.
 
-    Dataset outputs are compared with simulated ones over windows whose start is free. A cause is named when its fall in score
+    Measured outputs are compared with simulated ones over windows whose start is free. A cause is named when its fall in score
     pays for its parameters and for the number of rivals, and when a later stretch of the data agrees. The gain is measured by
     free rollouts over `hold_out` (default: the last quarter), which no fit has seen, at the given horizons in s. experiment:
     what an experiment may do that tells apart what these data do not: `limits` of inputs and outputs, `seconds`. train: the
-    trajectories that are fitted. An engine in contact is rolled out itself; folder: keeps that for an interrupted search.
+    trajectories that are fitted. A model for which there is a `diagnoser`, such as an engine in contact, which is rolled out
+    itself, is left to that; folder: keeps what an interrupted search goes on with.
     """
-    clock = _Clock(emit)
+    clock = Clock(emit)
     _timed(model, recording, horizons)
-    fitting, held_out = recording.split(hold_out or {"last": 0.25}, train)
-    chosen = _effects(effects)
-    if isinstance(model, NativeModel):
-        given = (fitting, held_out), {e.name for e in chosen}, horizons, window, seed, emit, folder, clock.lap
-        return replace(diagnose_native(model, *given), timings=clock.laps)
-    library = Library(model, Dataset.of(model, fitting), chosen)
-    measured = library.measured
-    held = _held(model, measured, *recording.led_up(held_out))
-    _warned(emit, measured, held)
-    assumed = kept_within(model, measured, held)
-    windows = measured.windows(_length(measured, model, window)).thinned(ENOUGH, GUARDED)
-    stretches(held, horizons)  # refuses before the search is paid for
-    clock.lap("evidence")
+    parts, more = recording.split(hold_out or {"last": 0.25}, train), experiment or {}
+    problem = DiagnosisProblem(model, recording, *parts, _effects(effects), horizons, window, more, seed, emit, folder, clock)
+    others = (c.load()() for c in registry().of("diagnoser") if c.missing() is None)
+    answer = next((d.diagnose for d in others if d.accepts(model)), _searched)
+    return replace(answer(problem), timings=clock.laps)
 
-    settled = across(library, chosen, windows, clock.tell)
-    clock.lap("search")
 
-    answer, measured = answered(settled.search, settled.found, windows), settled.search.windows.measured
+def _searched(problem: DiagnosisProblem) -> Diagnosis:
+    """With equations: effects are added to them, and what does not pay is dropped."""
+    data, lap, seed = _Data.of(problem), problem.clock.lap, problem.seed
+    lap("evidence")
+
+    settled = across(data.library, problem.effects, data.windows, problem.clock.tell)
+    lap("search")
+
+    answer = answered(settled.search, settled.found, data.windows)
     if settled.settings:
-        answer = replace(answer, plain=fit(library.hypothesis(()), answer.search.windows))
-    judges = stretches(replace(held, hold=measured.hold), horizons, measured, answer.fit)
-    named = _causes(answer := _largest_first(answer, judges[-1]), settled.settings, judges[-1])
-    clock.lap("rivals")
+        answer = replace(answer, plain=fit(data.library.hypothesis(()), answer.windows))
+    judges = data.stretches(problem.horizons, answer)
+    judge, settings = judges[-1], settled.settings
+    answer = _largest_first(answer, judge)
+    named = tuple(_set(answer, s, judge) for s in settings) + tuple(_named(answer, c, judge) for c in answer.causes)
+    named += tuple(_read(answer, c, numbers, judge) for c, numbers in answer.library.seen)
+    lap("rivals")
 
     gain = {f"{j.horizon:g}": j.gains(answer.nothing, answer.fit, seed) for j in judges}
-    clock.lap("gain")
-    limits = _limits(library.model, measured, experiment or {})
-    design = told_apart(answer.causes, answer.fit, answer.ties, measured, limits, seed)[0]
-    clock.lap("experiment")
-    left = leftover.left(library.extended(answer.causes, values(answer.fit)), answer.fit, answer.search.windows, seed)
-    doubt = clocks.doubt(answer.fit, answer.search.windows)
+    lap("gain")
+    dataset, asked = answer.dataset, problem.experiment
+    limits = Limits.of(data.library.model, dataset, asked.get("limits"), asked.get("seconds", 12.0))
+    design = told_apart(answer.causes, answer.fit, answer.ties, dataset, limits, seed)[0]
+    lap("experiment")
+    left = leftover.left(data.library.extended(answer.causes, values(answer.fit)), answer.fit, answer.windows, seed)
+    doubt = clocks.doubt(answer.fit, answer.windows)
     verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, design is not None, bool(doubt))
-    named = tuple(replace(c, flags=(*c.flags, *leftover.doubts(len(named), left))) for c in named)
-    clock.lap("leftover")
-    told = _told(verdict, named, answer, gain, left, design, judges[-1], settled.settings, clock)
-    return replace(told, assumptions=(*assumed, *doubt), seconds=_tried(answer, limits, design))
+    lap("leftover")
+    ties = [tuple(c.key for c in tie) for tie, _ in answer.ties]
+    ties += [(("engine-setting", s.runner_up.setting),) for s in settings if s.runner_up and s.margin < TIE]
+    rest = leftover.unexplained(left) if verdict == "unexplained" else None
+    plain = None if answer.plain is None else (f"setting {' and '.join(s.variant.setting for s in settings)}", answer.plain)
+    return Diagnosis(
+        verdict,
+        tuple(replace(c, flags=(*c.flags, *leftover.doubts(len(named), left))) for c in named),
+        _misfits(answer),
+        gain,
+        _extended(answer),
+        tuple(ties),
+        None if design is None else _experiment(answer),
+        rest,
+        figure(answer.search, answer.causes, answer.fit, judge, design, rest.correction if rest else None, plain),
+        design=design,
+        evidence=evidence(left),
+        negligible=tuple((*k, s) for k, s in answer.negligible.items() if k not in keys(answer.causes)),
+        smallest=smallest(answer.search) if verdict == "nothing" else (),
+        log={**dataset.log, "hold": dataset.hold or "undeclared"},
+        assumptions=(*data.assumptions, *doubt),
+        # How long the experiments were, of which none tells the ties apart.
+        seconds=limits.seconds if answer.ties and limits.inputs and not design else None,
+        warnings=coarse(answer.fit, answer.windows),
+        refitted=_refitted(answer),
+    )
 
 
-def _tried(answer: Answer, limits: Limits, design: Experiment | None) -> float | None:
-    """How long the experiments were, of which none tells the ties apart."""
-    return limits.seconds if answer.ties and limits.inputs and not design else None
+@final
+@dataclass(frozen=True)
+class _Data:
+    """All data of a diagnosis in the terms of its model: what is fitted, as it is read and in windows, and what is held out.
 
+    assumptions: what is taken for granted of them, in words.
+    """
 
-def _limits(model: Model, measured: Dataset, experiment: Mapping[str, Any]) -> Limits:
-    return Limits.of(model, measured, experiment.get("limits"), experiment.get("seconds", 12.0))
+    library: Library
+    windows: Windows
+    held: Dataset
+    assumptions: tuple[str, ...]
 
+    @classmethod
+    def of(cls, problem: DiagnosisProblem) -> _Data:
+        """UsageError where they are too few, or in other terms."""
+        model, (with_past, since) = problem.model, problem.recording.led_up(problem.held_out)
+        library = Library(model, Dataset.of(model, problem.fitted), problem.effects)
+        fitted = library.measured
+        held = replace(Dataset.of(model, with_past), sigma=fitted.sigma, spread=fitted.spread, since=since)
+        _warned(problem.emit, fitted, held)
+        assumed = kept_within(model, fitted, held)
+        data = cls(library, fitted.windows(_length(fitted, model, problem.window)).thinned(ENOUGH, GUARDED), held, assumed)
+        data.stretches(problem.horizons)  # refuses before the search is paid for
+        return data
 
-def _held(model: Model, fitted: Dataset, with_past: Recording, since: tuple[float, ...]) -> Dataset:
-    """What is held out, with what was measured before it, in the terms of what is fitted."""
-    return replace(Dataset.of(model, with_past), sigma=fitted.sigma, spread=fitted.spread, since=since)
+    def stretches(self, horizons: Sequence[float], answer: Answer | None = None) -> tuple[Stretches, ...]:
+        """What is held out, one per horizon; as an answer holds the inputs, and as its fit finds starts best."""
+        if answer is None:
+            return stretches(self.held, horizons)
+        return stretches(self.held.with_hold(answer.dataset.hold), horizons, answer.dataset, answer.fit)
 
 
 def _warned(emit: Emit, fitted: Dataset, held: Dataset) -> None:
@@ -134,96 +176,15 @@ def _largest_first(answer: Answer, judge: Stretches) -> Answer:
     return replace(answer, causes=tuple(sorted(answer.causes, key=left, reverse=True)))
 
 
-def _causes(answer: Answer, settings: Sequence[Setting], judge: Stretches) -> tuple[Cause, ...]:
-    """Settings, effects, and what shows in the measured values alone."""
-    named = tuple(_set(answer, s, judge) for s in settings)
-    named += tuple(_named(answer, c, judge) for c in answer.causes)
-    return named + tuple(_read(answer, c, numbers, judge) for c, numbers in answer.search.library.seen)
-
-
-def _told(
-    verdict: Verdict,
-    named: tuple[Cause, ...],
-    answer: Answer,
-    gain: Mapping[str, Mapping[str, Gain]],
-    left: leftover.Left,
-    design: Experiment | None,
-    judge: Stretches,
-    set_: Sequence[Setting],
-    clock: _Clock,
-) -> Diagnosis:
-    others = [(("engine-setting", s.runner_up.setting),) for s in set_ if s.runner_up and s.margin < TIE]
-    rest = leftover.unexplained(left) if verdict == "unexplained" else None
-    measured = answer.search.windows.measured
-    settings = [c.site for c in named if c.effect == "engine-setting"]
-    plain = None if answer.plain is None else (f"setting {' and '.join(settings)}", answer.plain)
-    return Diagnosis(
-        verdict,
-        named,
-        _misfits(answer, measured),
-        gain,
-        _extended(answer),
-        (*(tuple(c.key for c in tie) for tie, _ in answer.ties), *others),
-        None if design is None else _experiment(answer),
-        rest,
-        figure(answer.search, answer.causes, answer.fit, judge, design, rest.correction if rest else None, plain),
-        clock.laps,
-        design=design,
-        evidence=evidence(left),
-        negligible=tuple((*k, s) for k, s in answer.negligible.items() if k not in keys(answer.causes)),
-        smallest=smallest(answer.search) if verdict == "nothing" else (),
-        log={**measured.log, "hold": measured.hold or "undeclared"},
-        warnings=coarse(answer.fit, answer.search.windows),
-        refitted=_refitted(answer),
-    )
-
-
 def _refitted(answer: Answer) -> dict[str, dict[str, Any]]:
     """The stated parameters that have a tolerance, and what the data make of them beside the causes."""
-    library, last = answer.search.library, answer.fit
-    known, widths = values(last), dict(zip(last.hypothesis.names, map(float, last.interval()), strict=True))
+    library, known = answer.library, answer.fit.estimates()
     freed = {library.extension(c).frees for c in answer.causes}
     loose = [p for p in library.model.parameters if p.tolerance > 0 and p.name in known and p.name not in freed]
-    return {
-        p.name: {
-            "stated": p.value,
-            "value": known[p.name],
-            "low": known[p.name] - widths[p.name],
-            "high": known[p.name] + widths[p.name],
-            "unit": p.unit,
-        }
-        for p in loose
-    }
-
-
-@final
-class _Clock:
-    """Wall time per part, and progress for observers."""
-
-    def __init__(self, emit: Emit) -> None:
-        self.emit, self.count, self.last, self.told = emit, 0, time.perf_counter(), 0.0
-        self.laps: dict[str, float] = {}
-        self.best: Mapping[str, Any] = {}
-
-    def lap(self, name: str) -> None:
-        now = time.perf_counter()
-        self.laps[name], self.last = round(now - self.last, 3), now
-
-    def tell(self, text: str, best: Mapping[str, Any] | None = None, *, fitted: bool = True) -> None:
-        """What is tried next: a hypothesis that is fitted, or one of many that are only screened, of which few are told."""
-        now = time.perf_counter()
-        self.count += fitted
-        if fitted or now - self.told > BEAT:
-            self.told = now
-            # A search that begins anew, on other windows, has no best of its own yet.
-            self.best = best or self.best
-            more = {"best": self.best} if self.best else {}
-            self.emit(Event("progress", "diagnosis", {"done": self.count, "unit": "hypotheses", "text": text, **more}))
+    return {p.name: {"stated": p.value, **vars(Estimate.of(*known[p.name], p.unit))} for p in loose}
 
 
 def _effects(effects: Sequence[Effect | str] | Literal["all"]) -> list[Effect]:
-    from gapcert.plugin import registry
-
     known = registry()
     names = known.names("effect") if effects == "all" else effects
     found: list[Effect] = [known.build("effect", e) if isinstance(e, str) else e for e in names]
@@ -261,7 +222,7 @@ def _length(measured: Dataset, model: Model, window: float | None) -> int:
 
 def _named(answer: Answer, c: Candidate, judge: Stretches) -> Cause:
     """A cause with its numbers, its share, its runner-up, and what speaks against it."""
-    library, last = answer.search.library, answer.fit
+    library, last = answer.library, answer.fit
     rest = tuple(k for k in answer.causes if k is not c)
     before = judge.error(answer.search.fit(rest, (answer.causes, last)))
     runner_up = None
@@ -279,13 +240,13 @@ def _set(answer: Answer, s: Setting, judge: Stretches) -> Cause:
     """A setting of the engine: what it explains beside all other causes, refitted without it."""
     h = Library(s.before.model, s.before.measured, []).hypothesis(answer.causes)
     known = dict(zip(h.names, h.value.tolist(), strict=True)) | values(answer.fit)
-    before = judge.error(fit(h, answer.search.windows, theta=np.array([known[n] for n in h.names])))
+    before = judge.error(fit(h, answer.windows, theta=np.array([known[n] for n in h.names])))
     v, numbers = s.variant, dict[str, Estimate]()
     if isinstance(v.value, int | float) and not isinstance(v.value, bool):
-        numbers["value"] = Estimate(float(v.value), "1", float(v.value), float(v.value))
+        numbers["value"] = Estimate.of(float(v.value))
     rival = None
     if s.runner_up is not None:
-        other = fit(Library(s.runner_up.model, s.before.measured, []).hypothesis(()), answer.search.windows)
+        other = fit(Library(s.runner_up.model, s.before.measured, []).hypothesis(()), answer.windows)
         rival = Rival("engine-setting", s.runner_up.setting, _share(judge.error(other), before), s.margin, judge.rms(other))
     share = _share(judge.error(answer.fit), before)
     changed = {"value": v.value, "was": v.was}
@@ -294,43 +255,40 @@ def _set(answer: Answer, s: Setting, judge: Stretches) -> Cause:
 
 def _read(answer: Answer, c: Candidate, numbers: Mapping[str, float], judge: Stretches) -> Cause:
     """A cause that shows in the measured values alone: explained is what it makes of the error without taking part in it."""
-    library, m = answer.search.library, judge.windows.measured
+    library, m = answer.library, judge.windows.measured
     channel = [s.name for s in m.channels].index(c.site)
     before = judge.error(answer.fit) ** 2
     # All of the noise floor, where the rounding is most of it.
     left = max(0.0, before - m.sigma[channel] ** 2 / m.spread[channel] ** 2 / len(m.channels))
     known = {
-        p.name: Estimate(numbers[n], unit, numbers[n], numbers[n])
+        p.name: Estimate.of(numbers[n], unit=unit)
         for p, n, unit in zip(c.effect.parameters, library.names(c), library.units(c), strict=True)
     }
     return Cause(*c.key, known, _share(math.sqrt(left), math.sqrt(before)))
 
 
 def _extended(answer: Answer) -> Model:
-    library, numbers = answer.search.library, values(answer.fit)
+    library, numbers = answer.library, values(answer.fit)
     for _, found in library.seen:
         numbers |= found
     return library.extended((*answer.causes, *(c for c, _ in library.seen)), numbers)
 
 
 def _numbers(library: Library, c: Candidate, last: Fit) -> dict[str, Estimate]:
-    known, widths = values(last), dict(zip(last.hypothesis.names, map(float, last.interval()), strict=True))
-    names = library.names(c)
-    shown = c.effect.canonical({p.name: known[n] for p, n in zip(c.effect.parameters, names, strict=True)})
-    numbers = {}
-    for p, name, unit in zip(c.effect.parameters, names, library.units(c), strict=True):
-        value, half = shown[p.name], widths[name]
-        numbers[p.name] = Estimate(value, unit, value - half, value + half)
-    return numbers
+    parameters, known = c.effect.parameters, [last.estimates()[n] for n in library.names(c)]
+    shown = c.effect.canonical({p.name: value for p, (value, _) in zip(parameters, known, strict=True)})
+    rows = zip(parameters, known, library.units(c), strict=True)
+    return {p.name: Estimate.of(shown[p.name], half, unit) for p, (_, half), unit in rows}
 
 
 def _share(after: float, before: float) -> float:
     return 1 - after / before if before > 0 else 0.0
 
 
-def _misfits(answer: Answer, measured: Dataset) -> dict[str, Misfit]:
-    old, new = (np.sqrt(f.chi) * measured.sigma for f in (answer.nothing, answer.fit))
-    return {c.name: Misfit(float(old[i]), float(new[i]), float(measured.sigma[i])) for i, c in enumerate(measured.channels)}
+def _misfits(answer: Answer) -> dict[str, Misfit]:
+    m = answer.dataset
+    old, new = (np.sqrt(f.chi) * m.sigma for f in (answer.nothing, answer.fit))
+    return {c.name: Misfit(*map(float, row)) for c, *row in zip(m.channels, old, new, m.sigma, strict=True)}
 
 
 def _experiment(answer: Answer) -> str | None:

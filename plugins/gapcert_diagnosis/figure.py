@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -50,7 +49,7 @@ def figure(
     return DiagnosisFigure(
         _channels(judge, first, last),
         laws(path, correction) + outputs(path),
-        _waterfall(judge, named, fits),
+        Waterfall(("none of the causes", *named), np.array([judge.error(f) for f in fits])) if named else None,
         tuple(_correlations(windows, first, last)),
         tuple(_courses(windows, first, last)),
         () if design is None else _signals(design, search.library.model),
@@ -66,12 +65,6 @@ def _channels(judge: Stretches, first: Fit, last: Fit) -> tuple[Channel, ...]:
     t = w.t[k] + m.period * (judge.lead + np.arange(w.length - judge.lead))
     y = w.y[k, judge.lead :]
     return tuple(Channel(c.name, c.unit, t, y[:, i], before[k, :, i], after[k, :, i]) for i, c in enumerate(m.channels))
-
-
-def _waterfall(judge: Stretches, named: Sequence[str], fits: Sequence[Fit]) -> Waterfall | None:
-    if not named:
-        return None
-    return Waterfall(("none of the causes", *named), np.array([judge.error(f) for f in fits]))
 
 
 def _correlations(windows: Windows, first: Fit, last: Fit) -> list[Correlation]:

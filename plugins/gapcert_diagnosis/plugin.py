@@ -7,7 +7,7 @@ from gapcert.plugin import EXECUTED, RUN, Argument, Component, hookimpl
 
 @hookimpl
 def gapcert_components() -> list[Component]:
-    """The sections `diagnose:` and `play:`, their commands, and what every effect keeps."""
+    """The sections `diagnose:` and `play:`, their commands, how engines are diagnosed, and what every effect keeps."""
     return [
         Component(
             "study",
@@ -18,6 +18,7 @@ def gapcert_components() -> list[Component]:
         ),
         Component("section", "play", "what is played to a reality", "gapcert_diagnosis.section:PlaySection"),
         Component("contract", "EffectContract", "what every effect keeps", "gapcert_diagnosis.testing:EffectContract"),
+        Component("diagnoser", "native", "numbers of an engine in contact", "gapcert_diagnosis.native.driver:NativeDiagnoser"),
         Component(
             "command",
             "diagnose",

@@ -34,6 +34,11 @@ class Estimate:
     low: float
     high: float
 
+    @classmethod
+    def of(cls, value: float, half: float = 0.0, unit: str = "1") -> Estimate:
+        """value ± half."""
+        return cls(value, unit, value - half, value + half)
+
 
 @final
 @dataclass(frozen=True)

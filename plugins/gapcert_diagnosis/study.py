@@ -19,13 +19,13 @@ from gapcert.plugin import (
     UsageError,
     forgets,
     magnitude,
-    registry,
     saved_digest,
 )
 from gapcert_recordings import play
 
 from .artifacts import left_behind
 from .diagnose import diagnose
+from .fitting.step_size import built
 from .section import DiagnoseConfig, PlayConfig
 
 if TYPE_CHECKING:
@@ -56,13 +56,11 @@ def answer(build: Build, asked: DiagnoseConfig, folder: Path, stages: Stages) ->
         if against is not None and c.controller is not None:
             build.make("controller").check(model, against[1], build.spec.goal(against[1]))
     with stages.stage("diagnosis"):
-        names = registry().names("effect") if asked.effects == "all" else asked.effects
-        effects = [registry().build("effect", name) for name in names]
         hold_out = asked.hold_out.model_dump(exclude_none=True, by_alias=True)
         found = diagnose(
             seen,
             recording,
-            effects,
+            asked.effects,
             hold_out=hold_out,
             train=None if asked.train is None else asked.train.model_dump(exclude_none=True),
             horizons=tuple(asked.horizons),
@@ -113,11 +111,7 @@ def _closer(build: Build, model: Model) -> tuple[Build, int]:
 
 def _paced(model: Model, parts: float) -> Model:
     """The same equations with a period 1/parts as long, in sub-steps as long as before."""
-    section = model.to_spec()
-    section |= {"period": f"{model.period / parts!r} s", "substeps": round(model.substeps / parts)}
-    config: Any = registry().config("model", section["kind"])
-    made: Model = registry().build("model", section["kind"], config.model_validate(section))
-    return made
+    return built(model.to_spec() | {"period": f"{model.period / parts!r} s", "substeps": round(model.substeps / parts)})
 
 
 def _played(build: Build, model: Model) -> Recording:

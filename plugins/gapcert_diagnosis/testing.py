@@ -16,6 +16,7 @@ from gapcert.plugin import PLAIN, Array, Effect, Model, Recording, expect, multi
 
 from .data.dataset import Dataset
 from .fitting.fit import fit, promising
+from .fitting.step_size import built as equations
 from .search.candidates import Candidate, Library
 
 ROD: Mapping[str, Any] = {
@@ -30,16 +31,9 @@ ROD: Mapping[str, Any] = {
     "period": "10 ms",
 }
 CARRIER: Mapping[str, Any] = {
-    "kind": "equations",
-    "coordinates": {"q": {"unit": "rad", "kind": "angle"}},
-    "inputs": {"u": "N*m"},
-    "parameters": {"m": {"value": "1 kg", "tolerance": "2 %"}, "l": "1 m", "g": "9.81 m/s^2"},
-    "mass_matrix": [["m*l**2/3"]],
-    "bias": {"q": "m*g*l/2*sin(q)"},
-    "forces": {"q": "u"},
+    **ROD,
+    "parameters": {**ROD["parameters"], "m": {"value": "1 kg", "tolerance": "2 %"}},
     "points": {"q": ["l*sin(q)", "-l*cos(q)"]},
-    "integrator": "rk4",
-    "period": "10 ms",
 }
 CART: Mapping[str, Any] = {
     "kind": "equations",
@@ -63,14 +57,6 @@ PAIR: Mapping[str, Any] = {
     "integrator": "rk4",
     "period": "10 ms",
 }
-
-
-def equations(section: Mapping[str, Any]) -> Model:
-    """A model from its section, through whatever plugin provides `equations`."""
-    known = registry()
-    config: Any = known.config("model", section["kind"])
-    model: Model = known.build("model", section["kind"], config.model_validate(dict(section)))
-    return model
 
 
 class EffectContract(ABC):

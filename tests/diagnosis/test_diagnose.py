@@ -8,6 +8,7 @@ from exams.hide import hide
 
 import gapcert as gc
 from gapcert.testing import multisine
+from gapcert_diagnosis import Diagnoser, Diagnosis
 from gapcert_diagnosis.testing import ROD, equations
 
 PERIOD = 0.01
@@ -211,3 +212,25 @@ def test_a_window_of_a_few_samples_is_refused():
     told = "diagnose.window: 0.02 s hold 2 samples, 0.01 s apart; expected 8 or more; give 0.08 s, or leave it out"
     with pytest.raises(gc.UsageError, match=told):
         find(*swung([DRY]), window=0.02)
+
+
+class Somebodys(Diagnoser):
+    """Of models of a kind that only somebody else knows."""
+
+    def accepts(self, model):
+        return len(model.coordinates) == 1
+
+    def diagnose(self, problem):
+        problem.clock.lap("asked")
+        return Diagnosis("nothing", (), {}, {}, problem.model, log={"fitted": len(problem.fitted.trajectories)})
+
+
+def test_a_model_is_left_to_a_diagnoser_that_accepts_it(monkeypatch):
+    model, recording = swung()
+    own = gc.plugin.Component("diagnoser", "somebodys", "knows its models", f"{__name__}:Somebodys")
+    known = gc.registry()
+    monkeypatch.setattr(known, "components", {**known.components, ("diagnoser", "somebodys"): own})
+    found = find(model, recording, FRICTIONS)
+    assert (found.verdict, found.log, list(found.timings)) == ("nothing", {"fitted": 1}, ["asked"])
+    monkeypatch.setattr(Somebodys, "accepts", lambda self, model: False)
+    assert "search" in find(model, recording, FRICTIONS, horizons=[0.5]).timings

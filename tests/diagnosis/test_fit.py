@@ -156,7 +156,7 @@ def test_a_bristle_is_bent_by_the_fitted_motion_and_not_by_noise(monkeypatch):
     off = []
     traced, reached = windows.retraced(motion)
     for seen in (windows, h.led(traced, np.empty(0), motion[:, 0], ~reached)):
-        bent = h.hidden(seen, np.empty((1, 0)), seen.drive[:, : seen.measured.history])
+        bent = h.hidden(seen, np.empty((1, 0)))
         off.append(np.abs(bent - true))
     assert reached.tolist() == [False, *[True] * (len(windows) - 1)]
     assert off[1].max() < 1e-3 < 0.02 < min(off[0][0].max(), off[0][1:].max())

@@ -186,8 +186,8 @@ def test_causes_that_leave_something_are_doubted():
 def test_a_direction_shows_what_is_too_little_for_other_tests(colour):
     for law, seen in ((None, False), ("slight", True)):
         recording = recorded(truth(law), colour=colour, noise=2e-3 if law is None else 1e-4)
-        found, last = left(recording)
-        lacking = lack(found.long, found.short, last)
+        found, _ = left(recording)
+        lacking = lack(found.long, found.short)
         assert (lacking is not None) == seen
     assert lacking.site == "q"
     assert lacking.sigmas > 5
@@ -196,24 +196,24 @@ def test_a_direction_shows_what_is_too_little_for_other_tests(colour):
 
 
 def test_what_no_single_force_is_like_shows_in_a_kind(monkeypatch):
-    found, last = left(recorded(truth(None), noise=2e-3))
+    found, _ = left(recorded(truth(None), noise=2e-3))
     columns = found.long.responses("q", features(found.long, "q")["periodic"]).reshape(found.long.residual.size, -1)
     columns /= np.linalg.norm(columns, axis=0)
     basis = columns @ lackoffit._spanning(columns.T @ columns)
     little = 2.2 * np.random.default_rng(2).choice([-1.0, 1.0], basis.shape[1])
     rough = replace(found.long, residual=found.long.residual + (basis @ little).reshape(found.long.residual.shape))
-    lacking = lack(rough, found.short, last)
+    lacking = lack(rough, found.short)
     assert lacking.kind == lackoffit.KINDS["periodic"]
     monkeypatch.setattr(lackoffit, "_together", lambda *given: 0.0)
-    assert lack(rough, found.short, last) is None
+    assert lack(rough, found.short) is None
 
 
 def test_the_noise_of_a_lack_is_drawn_once(monkeypatch):
-    found, last = left(recorded(truth("slight"), noise=1e-4))
+    found, _ = left(recorded(truth("slight"), noise=1e-4))
     drawn, plain = [], lackoffit.noise
     monkeypatch.setattr(lackoffit, "noise", lambda *given: drawn.append(given) or plain(*given))
     monkeypatch.setattr(lackoffit, "SIGMAS", 1.0)
-    assert lack(found.long, found.short, last) is not None
+    assert lack(found.long, found.short) is not None
     assert len(drawn) == 1
 
 
@@ -228,7 +228,7 @@ def test_what_swings_freely_may_lack_a_force_as_well():
     windows = library.measured.windows(120)
     last = fit(library.hypothesis(()), windows)
     found = leftover.left(library.extended((), dict(zip(last.hypothesis.names, last.theta, strict=True))), last, windows)
-    lacking = lack(found.long, found.short, last)
+    lacking = lack(found.long, found.short)
     assert lacking is not None
     assert lacking.site == "q"
 
@@ -258,13 +258,13 @@ def test_products_of_what_forces_make_need_no_outputs():
 
 
 def test_where_starts_make_nearly_all_outputs_are_made(monkeypatch):
-    found, last = left(recorded(truth("slight"), noise=1e-4))
-    lacking, made = lack(found.long, found.short, last), []
+    found, _ = left(recorded(truth("slight"), noise=1e-4))
+    lacking, made = lack(found.long, found.short), []
     monkeypatch.setattr(lackoffit, "LOST", 1.0)
     monkeypatch.setattr(
         lackoffit._Columns, "made", lambda *given, of=lackoffit._Columns.made: made.append(of(*given)) or made[-1]
     )
-    again = lack(found.long, found.short, last)
+    again = lack(found.long, found.short)
     assert made
     assert (again.site, again.kind) == (lacking.site, lacking.kind)
     assert again.sigmas == pytest.approx(lacking.sigmas, rel=1e-9)

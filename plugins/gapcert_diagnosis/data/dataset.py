@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, final
 
@@ -17,7 +17,6 @@ from gapcert_recordings import JITTER, Log, Piece, pieces
 HISTORY = 0.1  # s of input before a window that effects with memory may look back on
 UNEVEN = 0.05  # of the period: how far the median of uneven steps may be from the model's
 _HOLDS: tuple[Hold, ...] = ("zero", "first")
-COVERED = 0.7  # of the data: what windows side by side should reach
 QUIETEST = 1e-5  # of a channel's spread: the least noise floor
 FEWEST = 8  # samples in a window: fewer are lost in its free start
 SEEN = 0.5  # least share of a window's values that must be there
@@ -127,7 +126,7 @@ class Dataset:
         """Is there no noise, as in what a simulator says?"""
         return bool((self.sigma <= (1 + 1e-9) * QUIETEST * self.spread).all())
 
-    def with_hold(self, hold: Hold) -> Dataset:
+    def with_hold(self, hold: Hold | None) -> Dataset:
         """The same data with the input held in a given way."""
         return replace(self, hold=hold)
 
@@ -137,22 +136,6 @@ class Dataset:
     def brief(self, seconds: float) -> int:
         """Samples of a window that is to be short, but long enough to say something."""
         return max(FEWEST, self.samples(seconds))
-
-    @property
-    def shortest(self) -> int:
-        """Samples of the shortest trajectory, all its pieces together, without their histories."""
-        sizes = dict.fromkeys(self.source, 0)
-        for i, y in zip(self.source, self.outputs, strict=True):
-            sizes[i] += max(0, len(y) - self.history)
-        return min(sizes.values())
-
-    def fitting(self, wanted: int, least: int) -> int:
-        """The length of window, from `wanted` samples down to `least`, with which most of the pieces can be used."""
-        sizes = np.maximum(np.array([len(y) for y in self.outputs]) - self.history, 0)
-        length = wanted
-        while length > least and np.sum(sizes // length) * length < COVERED * np.sum(sizes):
-            length = max(least, length * 9 // 10)
-        return length
 
     def first(self, piece: int) -> int:
         """The first sample of a piece at which a window may begin."""
@@ -259,18 +242,19 @@ class Windows:
         for (piece, first), motion in zip(self.place.tolist(), x, strict=True):
             states[piece][first : first + self.length] = motion
             reached[piece][first : first + self.length] = True
-        at = [(piece, first - m.history) for piece, first in self.place.tolist()]
-        again = replace(self, measured=replace(m, states=tuple(states)), before=np.stack([states[i][k] for i, k in at]))
-        return again, np.array([reached[i][k] for i, k in at])
+        return self._with(states), np.array([reached[i][s - m.history] for i, s in self.place.tolist()])
 
     def begun(self, before: Array, rows: npt.NDArray[np.bool_]) -> Windows:
         """With guessed states (·, nx) where the histories of these rows begin."""
-        m, known = self.measured, self.before.copy()
-        known[rows] = before
-        states = [s.copy() for s in m.states]
+        states, history = [s.copy() for s in self.measured.states], self.measured.history
         for (piece, first), x in zip(self.place[rows].tolist(), before, strict=True):
-            states[piece][first - m.history] = x
-        return replace(self, measured=replace(m, states=tuple(states)), before=known)
+            states[piece][first - history] = x
+        return self._with(states)
+
+    def _with(self, states: Sequence[Array]) -> Windows:
+        """The same windows in a recording with these guessed states."""
+        m = replace(self.measured, states=tuple(states))
+        return replace(self, measured=m, before=np.stack([states[i][s - m.history] for i, s in self.place.tolist()]))
 
     def head(self, length: int) -> Windows:
         """Their first `length` samples."""

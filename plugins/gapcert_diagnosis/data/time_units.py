@@ -45,19 +45,16 @@ def agreeing(model: Model, recording: Recording) -> None:
         if not size or np.sum(moved * said) < PLAIN * size:
             continue
         slower = float(np.sqrt(np.sum(said**2) / np.sum(moved**2)))
+        ratio = float(f"{max(slower, 1 / slower):.2g}")
+        times = f"about {ratio:,.0f} times {'slower' if slower > 1 else 'faster'}"
         for unit, factor in UNITS.items():
             if abs(slower / factor - 1) < NEAR:
                 raise UsageError(
-                    f"recording: {q} moves {_times(slower)} than {v} says, with samples {recording.period:.6g} s apart; "
+                    f"recording: {q} moves {times} than {v} says, with samples {recording.period:.6g} s apart; "
                     f"expected one motion; is the time in {unit}? Then give the unit of that column, recording.units: "
                     f"{{TIME: {unit}}}; otherwise mend the unit of {v}",
                     ("recording",),
                 )
-
-
-def _times(slower: float) -> str:
-    ratio = float(f"{max(slower, 1 / slower):.2g}")
-    return f"about {ratio:,.0f} times {'slower' if slower > 1 else 'faster'}"
 
 
 def _moved(tr: Trajectory, q: str, v: str) -> tuple[Array, Array] | None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from gapcert.plugin import Array, Model, Recording, UsageError, difference
 from gapcert_diagnosis.data.dataset import Dataset, Windows, flat
-from gapcert_diagnosis.fitting.fit import Fit, fit
+from gapcert_diagnosis.fitting.fit import Fit, fit, nearby
 from gapcert_diagnosis.results import Experiment
 from gapcert_diagnosis.search.candidates import Causes
 
@@ -246,11 +246,7 @@ def _first_order(rival: Fit, windows: Windows) -> Array:
     """
     h, theta, p, nx = rival.hypothesis, rival.theta, len(rival.theta), windows.start.shape[1]
     start = fit(h.holding(theta), windows, iterations=BRIEF).start
-    size = np.maximum(np.sqrt(np.mean(start**2, axis=0)), 1e-3)
-    width = np.concatenate([np.where(theta + h.step > h.high, -h.step, h.step), 1e-5 * size])
-    thetas, starts = np.tile(theta, (1 + p + nx, 1)), np.tile(start, (1 + p + nx, 1, 1))
-    thetas[1 + np.arange(p), np.arange(p)] += width[:p]
-    starts[1 + p + np.arange(nx), :, np.arange(nx)] += width[p:, None]
+    thetas, starts, width = nearby(h, theta, start, h.step)
     m = windows.measured
     r = difference(m.channels, h.simulate(windows, thetas, starts), windows.y[None]) / m.sigma * windows.weight
     rows = np.nan_to_num(r.reshape(1 + p + nx, len(windows), -1), posinf=0.0, neginf=0.0)

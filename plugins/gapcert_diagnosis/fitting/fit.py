@@ -63,7 +63,7 @@ class Fit:
     def whiteness(self) -> Array:
         """κ (ny,) = (1 − ρ₁)/(1 + ρ₁): the share of samples that count as independent, from the lag-1 autocorrelation."""
         r, w = self.residual, self.weight
-        rho = np.sum(r[:, 1:] * r[:, :-1], axis=(0, 1)) / np.maximum(np.sum(r**2, axis=(0, 1)), 1e-300)
+        rho = lag_one(r)
         if w is not None:
             # Of as many neighbours as there would be without gaps.
             whole = self.counts * (w.shape[1] - 1) / w.shape[1]
@@ -101,6 +101,16 @@ class Fit:
         """Half widths (p,) of 95 % intervals; coloured residuals widen them."""
         variance = np.diag(self.covariance) * max(1.0, float(self.chi.mean())) / float(self.whiteness.min())
         return np.asarray(1.959964 * np.sqrt(np.maximum(variance, 0)))
+
+    def estimates(self) -> dict[str, tuple[float, float]]:
+        """Name → (value, half width of its 95 % interval)."""
+        rows = zip(self.hypothesis.names, self.theta.tolist(), self.interval().tolist(), strict=True)
+        return {name: (value, half) for name, value, half in rows}
+
+
+def lag_one(r: Array) -> Array:
+    """The correlation (ny,) of neighbouring samples of r (W, L, ny)."""
+    return np.asarray(np.sum(r[:, 1:] * r[:, :-1], axis=(0, 1)) / np.maximum(np.sum(r**2, axis=(0, 1)), 1e-300))
 
 
 def fit(
@@ -173,8 +183,8 @@ def stepped(fitted: Fit, windows: Windows, others: Sequence[Hypothesis]) -> list
     The slopes are those of the fit, which is all that many simulations cost that differ little from its own.
     """
     h, theta, start = fitted.hypothesis, fitted.theta, fitted.start
-    thetas, starts, width = _nearby(h, theta, start, _linearise(h, windows, theta, start).near(h))
-    r = _residual(h, windows, np.vstack([theta, thetas]), np.concatenate([start[None], starts]))
+    thetas, starts, width = nearby(h, theta, start, _linearise(h, windows, theta, start).near(h))
+    r = _residual(h, windows, thetas, starts)
     moved, n, out = r[1:] - r[0], max(1.0, float(np.count_nonzero(windows.weight))), list[Fit | None]()
     for other in others:
         now = _residual(other, windows, theta[None], start[None])[0]
@@ -282,8 +292,7 @@ def _settle(h: Hypothesis, windows: Windows, here: Slopes, ends: _Ends, rounds: 
 def promising(h: Hypothesis, windows: Windows, thetas: Array, start: Array) -> tuple[Array, Array, float]:
     """(theta, starts, Σ r²): the one of several thetas (b, p) that fits best once the starts have followed, to first order."""
     count, nx, held = len(thetas), start.shape[1], h.holding(h.value)
-    _, nearby, width = _nearby(held, np.empty(0), start, held.step)
-    starts = np.concatenate([start[None], nearby])
+    _, starts, width = nearby(held, np.empty(0), start, held.step)
     r = _residual(h, windows, np.repeat(thetas, 1 + nx, axis=0), np.tile(starts, (count, 1, 1)))
     r = r.reshape(count, 1 + nx, *windows.y.shape)
     best = h.value, start, np.inf
@@ -301,8 +310,8 @@ def slopes(fitted: Fit, windows: Windows) -> Array:
     """What moving each number of a fit by a step adds to the residual, (W, L·ny, p); 0 where that is not finite."""
     h, p = fitted.hypothesis, len(fitted.theta)
     step = _linearise(h, windows, fitted.theta, fitted.start).near(h)
-    thetas, starts, _ = _nearby(h, fitted.theta, fitted.start, step)
-    r = _residual(h, windows, np.vstack([fitted.theta, thetas[:p]]), np.stack([fitted.start, *starts[:p]]))
+    thetas, starts, _ = nearby(h, fitted.theta, fitted.start, step)
+    r = _residual(h, windows, thetas[: 1 + p], starts[: 1 + p])
     rows = (r[1:] - r[0]).reshape(p, len(windows), -1).transpose(1, 2, 0)
     return np.asarray(np.where(np.isfinite(rows), np.clip(rows, -STEEPEST, STEEPEST), 0.0))
 
@@ -349,17 +358,19 @@ def _linearise(
     """r: the residual there, where it is known; step (p,): of the differences, the hypothesis' own by default."""
     if r is None:
         r = _residual(h, windows, theta[None], start[None])[0]
-    thetas, starts, width = _nearby(h, theta, start, h.step if step is None else step)
-    return Slopes.of(theta, start, r, _residual(h, windows, thetas, starts), width)
+    thetas, starts, width = nearby(h, theta, start, h.step if step is None else step)
+    return Slopes.of(theta, start, r, _residual(h, windows, thetas[1:], starts[1:]), width)
 
 
-def _nearby(h: Hypothesis, theta: Array, start: Array, step: Array) -> tuple[Array, Array, Array]:
-    """thetas (p + nx, p), starts (p + nx, W, nx), each moved in one number, theta by `step` (p,); how far (p + nx,)."""
+def nearby(h: Hypothesis, theta: Array, start: Array, step: Array) -> tuple[Array, Array, Array]:
+    """thetas (1 + p + nx, p), starts (1 + p + nx, W, nx): these, then each moved in one number, theta by `step` (p,).
+
+    Also how far, (p + nx,).
+    """
     p, nx = len(theta), start.shape[1]
-    size = nudges(start)
     # Forward, or backward at an upper bound; the step of a dry law must be wide enough to see over its kinks.
-    h_theta = np.where(theta + step > h.high, -step, step)
-    thetas, starts = np.tile(theta, (p + nx, 1)), np.tile(start, (p + nx, 1, 1))
-    thetas[np.arange(p), np.arange(p)] += h_theta
-    starts[p + np.arange(nx), :, np.arange(nx)] += size[:, None]
-    return thetas, starts, np.concatenate([h_theta, size])
+    width = np.concatenate([np.where(theta + step > h.high, -step, step), nudges(start)])
+    thetas, starts = np.tile(theta, (1 + p + nx, 1)), np.tile(start, (1 + p + nx, 1, 1))
+    thetas[1 + np.arange(p), np.arange(p)] += width[:p]
+    starts[1 + p + np.arange(nx), :, np.arange(nx)] += width[p:, None]
+    return thetas, starts, width

@@ -74,16 +74,14 @@ class Hypothesis:
     def motion(self, windows: Windows, theta: Array, start: Array, every: int = 1) -> Array:
         """States (b·W, (L − 1)·repeat // every + 1, nx) at every `every`-th model step."""
         b, w, m = len(theta), len(windows), windows.measured
-        past, u = m.past, windows.drive
         hidden = None if windows.memory is None else np.tile(windows.memory, (b, 1))
         if self.model.hidden and hidden is None:
             # Rows that differ in their starts alone have one past.
             given = [tuple(row) for row in theta.tolist()]
             different = sorted(set(given))
-            hidden = self.hidden(windows, np.array(different), u[:, :past]).reshape(len(different), w, -1)
-            hidden = hidden[[different.index(row) for row in given]]
-            hidden = hidden.reshape(b * w, -1)
-        u = u[:, past : past + (windows.length - 1) * m.repeat]
+            hidden = self.hidden(windows, np.array(different)).reshape(len(different), w, -1)
+            hidden = hidden[[different.index(row) for row in given]].reshape(b * w, -1)
+        u = windows.drive[:, m.past : m.past + (windows.length - 1) * m.repeat]
         start = start.reshape(b * w, -1)
         return self.model.fast_rollout(start, u, parameters=self._values(theta, w), hidden=hidden, every=every).x
 
@@ -112,12 +110,11 @@ class Hypothesis:
 
     def remembering(self, windows: Windows, theta: Array) -> Windows:
         """Windows for rollouts at one theta (p,) only: what the model remembers where they begin is found once."""
-        known = self.hidden(windows, theta[None], windows.drive[:, : windows.measured.past]) if self.model.hidden else None
-        return replace(windows, memory=known)
+        return replace(windows, memory=self.hidden(windows, theta[None]) if self.model.hidden else None)
 
-    def hidden(self, windows: Windows, theta: Array, u: Array) -> Array:
+    def hidden(self, windows: Windows, theta: Array) -> Array:
         """Hidden states (b·W, nh) at the windows' beginnings, from motions through the history before them."""
-        b, w = len(theta), len(windows)
+        b, w, u = len(theta), len(windows), windows.drive[:, : windows.measured.past]
         hidden = recalled(self.model, windows, self._values(theta, 1), b)
         before, values = np.tile(windows.before, (b, 1)), self._values(theta, w)
         after = self.model.fast_rollout(before, u, parameters=values, hidden=hidden, every=max(1, u.shape[1])).hidden

@@ -229,13 +229,14 @@ class Motion:
 @final
 @dataclass(frozen=True)
 class Tangent:
-    """Windows along a fitted path: x, u (W, S, ·) at every model step, residual (W, L·ny), measured − fitted.
+    """Windows along the path of a fit: x, u (W, S, ·) at every model step, residual (W, L·ny), measured − fitted.
 
     linear: the motion beside it, in units of the noise floor; what starts make of it is never held against a model.
     """
 
     model: Model
     windows: Windows
+    fitted: Fit
     x: Array
     u: Array
     linear: LinearisedMotion
@@ -255,7 +256,7 @@ class Tangent:
         x, u = x[:, :-1], u[:, : x.shape[1] - 1]
         A = model.jacobian(flat(x), flat(u))[:, :, :nx].reshape(*x.shape, nx) if model.hidden else _slopes(model, x, u)
         residual = -fitted.residual.reshape(len(windows), -1)
-        return cls(model, windows, x, u, LinearisedMotion(A, observe, m.repeat), residual)
+        return cls(model, windows, fitted, x, u, LinearisedMotion(A, observe, m.repeat), residual)
 
     @property
     def free(self) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -18,6 +19,13 @@ FEW = 8  # windows that are simulated with half the step
 FAST = 0.5  # of a step times the fastest rate in rad/s: below, an integrator follows what it steps
 
 
+def built(section: Mapping[str, Any]) -> Model:
+    """A model from its section, through whatever plugin provides its kind."""
+    config: Any = registry().config("model", section["kind"])
+    made: Model = registry().build("model", section["kind"], config.model_validate(dict(section)))
+    return made
+
+
 def stepped(model: Model, substeps: int, period: float | None = None) -> Model | None:
     """The same equations in so many sub-steps; None where no integrator steps the model, or an engine's, which is meant.
 
@@ -28,10 +36,7 @@ def stepped(model: Model, substeps: int, period: float | None = None) -> Model |
     section = model.to_spec()
     if section.get("kind") != "equations" or {"next", "memory"} & section.keys():
         return None
-    section |= {"substeps": substeps} | ({} if period is None else {"period": f"{period!r} s"})
-    config: Any = registry().config("model", "equations")
-    made: Model = registry().build("model", "equations", config.model_validate(section))
-    return made
+    return built(section | {"substeps": substeps} | ({} if period is None else {"period": f"{period!r} s"}))
 
 
 def fastest(model: Model, x: Array, u: Array) -> float:

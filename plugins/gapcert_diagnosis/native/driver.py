@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, final
 
 import numpy as np
 
-from gapcert.plugin import Array, Emit, Event, Recording, UsageError, difference
+from gapcert.plugin import Array, Emit, Event, Model, Recording, UsageError, difference
+from gapcert_diagnosis.problem import Diagnoser, DiagnosisProblem
 from gapcert_diagnosis.results import Cause, Diagnosis, Estimate, Gain, Misfit, Rival, Verdict
 from gapcert_diagnosis.search.criterion import agreement
 from gapcert_engines import NativeModel
@@ -30,31 +30,34 @@ ENOUGH = 0.3  # of the held-out error: what causes explain, so that they are the
 UNSEEN, ALIKE, STEP = 1e-3, 0.95, 0.05  # noise floors; correlation; change of a parameter
 
 
-def diagnose_native(
-    model: NativeModel,
-    parts: tuple[Recording, Recording],
-    effects: Collection[str],
-    horizons: Sequence[float],
-    window: float | None,
-    seed: int,
-    emit: Emit,
-    folder: Path | None,
-    lap: Callable[[str], None],
-) -> Diagnosis:
+@final
+class NativeDiagnoser(Diagnoser):
+    """Of a physics engine that no equations stand in for: it is rolled out itself."""
+
+    def accepts(self, model: Model) -> bool:
+        return isinstance(model, NativeModel)
+
+    def diagnose(self, problem: DiagnosisProblem) -> Diagnosis:
+        assert isinstance(problem.model, NativeModel)
+        return diagnose_native(problem.model, problem)
+
+
+def diagnose_native(model: NativeModel, problem: DiagnosisProblem) -> Diagnosis:
     """The native parameters and settings that are wrong: fitted to one part of a recording, judged on the other.
 
     Rollouts start from measured states, in flight from what its first samples say, over a short window and over the longest
     horizon; a horizon longer than a trajectory ends with it. A trajectory is one voice: causes are named where trajectories
     that a fit has not seen agree, beyond chance among so many nominees; intervals come from drawing trajectories again.
     """
+    parts, horizons, seed, lap = (problem.fitted, problem.held_out), problem.horizons, problem.seed, problem.clock.lap
     fitted, held = _checked(model, parts)
     if not horizons:
         raise UsageError("diagnose: no horizon is given; name at least one in seconds, such as [0.5]")
-    tell = _counted(emit)
-    entries = nominees(model, effects, simulated=bool(parts[0].noise))
-    store = Scores(None if folder is None else folder / "scores")
+    tell = _counted(problem.emit)
+    entries = nominees(model, {e.name for e in problem.effects}, simulated=bool(parts[0].noise))
+    store = Scores(None if problem.folder is None else problem.folder / "scores")
     lap("evidence")
-    contest = Contest(model, fitted, entries, sorted({window or WINDOW, max(horizons)}), store, tell)
+    contest = Contest(model, fitted, entries, sorted({problem.window or WINDOW, max(horizons)}), store, tell)
     best = contest.found()
     lap("search")
     judge = _Judge(held, tuple(sorted(horizons)), store)

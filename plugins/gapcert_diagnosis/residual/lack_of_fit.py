@@ -12,6 +12,7 @@ import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import islice
+from operator import attrgetter
 from typing import final
 
 import numpy as np
@@ -20,7 +21,7 @@ from scipy.special import chdtrc, ndtri
 
 from gapcert.plugin import Array
 from gapcert_diagnosis.data.dataset import flat
-from gapcert_diagnosis.fitting.fit import Fit, slopes
+from gapcert_diagnosis.fitting.fit import slopes
 from gapcert_diagnosis.fitting.linearised import Tangent, states
 
 from .regression import features, input_features
@@ -60,14 +61,14 @@ class Lack:
     sigmas: float
 
 
-def lack(long: Tangent, short: Tangent, last: Fit, seed: int = 0) -> Lack | None:
-    """None where no score stands out; last: the fit on the long windows; short: shows the colour of the noise."""
-    gone, shared = _absorbed(long, last), input_features(long)
+def lack(long: Tangent, short: Tangent, seed: int = 0) -> Lack | None:
+    """None where no score stands out; short: shows the colour of the noise."""
+    gone, shared = _absorbed(long), input_features(long)
     r = _without(gone, long.project(long.residual).reshape(1, -1))
     against = np.concatenate([long.free, *(a.reshape(*long.residual.shape, -1) for a in (gone, r.T))], axis=2)
     weighed = long.linear.adjoint(against)
     drawn = functools.cache(lambda: [_without(gone, n.reshape(len(n), -1)) for n in noise(long, short, seed)])
-    best = Lack("", "", SIGMAS)
+    best, clearly = Lack("", "", SIGMAS), attrgetter("sigmas")
     for site in long.model.sites("coordinate"):
         forces = _Forces.of(long, site, *weighed)
         found = {**shared, **features(long, site), **_shapes(long, site)}
@@ -77,13 +78,9 @@ def lack(long: Tangent, short: Tangent, last: Fit, seed: int = 0) -> Lack | None
             sigmas = np.abs(columns.along)
             if len(some := np.flatnonzero(sigmas > best.sigmas)):
                 coloured = np.sqrt(np.max([np.mean(s[:, some] ** 2, axis=0) for s in scores()], axis=0))
-                best = max(best, Lack(site, kind, float(np.max(sigmas[some] / np.maximum(1.0, coloured)))), key=_clearly)
-            best = max(best, Lack(site, kind, _together(columns, best.sigmas, scores)), key=_clearly)
+                best = max(best, Lack(site, kind, float(np.max(sigmas[some] / np.maximum(1.0, coloured)))), key=clearly)
+            best = max(best, Lack(site, kind, _together(columns, best.sigmas, scores)), key=clearly)
     return Lack(best.site, KINDS.get(best.kind, best.kind), best.sigmas) if best.site else None
-
-
-def _clearly(found: Lack) -> float:
-    return found.sigmas
 
 
 def _without(gone: Array, rows: Array) -> Array:
@@ -198,9 +195,9 @@ def _rare(total: float, k: float) -> float:
     return float(-ndtri(max(float(chdtrc(k, total)), 1e-300)))
 
 
-def _absorbed(motion: Tangent, last: Fit) -> Array:
+def _absorbed(motion: Tangent) -> Array:
     """An orthonormal basis (W·L·ny, k) of what the fitted numbers make, with the starts free to follow."""
-    rows = motion.project(slopes(last, motion.windows)).reshape(motion.residual.size, -1)
+    rows = motion.project(slopes(motion.fitted, motion.windows)).reshape(motion.residual.size, -1)
     if not rows.shape[1]:
         return rows
     u, size, _ = np.linalg.svd(rows / (np.linalg.norm(rows, axis=0) + 1e-300), full_matrices=False)

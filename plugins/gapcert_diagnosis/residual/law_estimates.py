@@ -66,12 +66,11 @@ class Fitted:
     """The last fit along its own motion: what each cause adds there, and what small further forces would do."""
 
     def __init__(self, library: Library, causes: Causes, fitted: Fit, windows: Windows) -> None:
-        self.library, self.causes, self.fitted, self.windows = library, causes, fitted, windows
+        self.library, self.causes, self.windows = library, causes, windows
         self.values = dict(zip(fitted.hypothesis.names, map(float, fitted.theta), strict=True))
         self.base, self.full = self.without(causes), library.extended(causes, self.values)
         self.tangent = Tangent.of(self.full, windows, fitted)
         self.x, self.u = self.tangent.x, self.tangent.u
-        self._added: dict[Causes, Array] = {}
         self._places: dict[tuple[str, str], Place] = {}
 
     @property
@@ -100,9 +99,7 @@ class Fitted:
 
     def added(self, group: Causes) -> Array:
         """What the causes of a group add to the next state, all others kept: (W, S, nx)."""
-        if group not in self._added:
-            self._added[group] = difference(self.base.states, self.after, self.next(self.without(group)))
-        return self._added[group]
+        return self.tangent.once(group, lambda: difference(self.base.states, self.after, self.next(self.without(group))))
 
     def place(self, site: str, kind: str) -> Place:
         """Where a coordinate or an input acts."""
@@ -294,7 +291,8 @@ def _drawn(shape: str, x: Array, law: Array) -> tuple[Array, Array]:
 def outputs(path: Fitted) -> tuple[Law, ...]:
     """What named faults of sensors add to a reading, against the reading without them."""
     m, w, drawn = path.windows.measured, path.windows, []
-    h, at = path.fitted.hypothesis, (path.fitted.theta[None], path.fitted.start[None])
+    last = path.tangent.fitted
+    h, at = last.hypothesis, (last.theta[None], last.start[None])
     x = h.motion(w, *at, every=m.repeat)
     u = flat(np.ascontiguousarray(w.u[:, m.history :]))
     plain = path.base.output(x.reshape(-1, path.base.nx), u)[:, list(m.columns)].reshape(w.y.shape)
@@ -304,10 +302,10 @@ def outputs(path: Fitted) -> tuple[Law, ...]:
         if c.effect.site != "output" or c.site not in names:
             continue
         i = names[c.site]
-        true, law, left = plain[..., i], read[..., i], -path.fitted.residual[..., i] * m.sigma[i]
+        true, law, left = plain[..., i], read[..., i], -last.residual[..., i] * m.sigma[i]
         member = np.unique(intervals(true, INTERVALS), return_inverse=True)[1].reshape(true.shape)
         sizes = np.bincount(member.ravel())
-        half = 1.96 * np.sqrt(means(left**2, member, len(sizes)) / sizes / path.fitted.whiteness[i])
+        half = 1.96 * np.sqrt(means(left**2, member, len(sizes)) / sizes / last.whiteness[i])
         axis = Axis(c.site, m.channels[i].unit, true)
         shape = "line" if carried(law, axis) >= ALONE else "loop"
         y, mid = means(law + left, member, len(sizes)), means(true, member, len(sizes))

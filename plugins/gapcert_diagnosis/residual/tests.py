@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from gapcert.plugin import Array
+from gapcert_diagnosis.fitting.fit import lag_one
 from gapcert_diagnosis.fitting.linearised import Tangent
 
 from .unexplained import Left
@@ -39,7 +40,7 @@ def evidence(found: Left) -> dict[str, dict[str, float]]:
         "mean square": by(np.mean(r**2, axis=(0, 1))),
         "mean square, short windows": by(np.mean(brief**2, axis=(0, 1))),
         "beyond coloured noise": by(found.growth.beyond),
-        "autocorrelation": by(_whiteness(r)),
+        "autocorrelation": by(lag_one(r)),
         "size with time": by(_together(r**2, long.windows.t[:, None] + m.period * np.arange(r.shape[1]))),
     }
     for i, spec in enumerate(long.model.inputs):
@@ -50,11 +51,6 @@ def evidence(found: Left) -> dict[str, dict[str, float]]:
         out[f"force with {spec.name}"] = {s: f.together(i) for s, f in seen.items()}
     memories = {s: v for s, f in seen.items() if (v := f.memory()) is not None}
     return out | ({"memory": memories} if memories else {})
-
-
-def _whiteness(r: Array) -> Array:
-    """The correlation (ny,) of neighbouring samples of r (W, L, ny)."""
-    return np.asarray(np.sum(r[:, 1:] * r[:, :-1], axis=(0, 1)) / np.maximum(np.sum(r**2, axis=(0, 1)), 1e-300))
 
 
 def _leading(r: Array, u: Array, history: int, most: int) -> Array:

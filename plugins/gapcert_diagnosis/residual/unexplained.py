@@ -46,18 +46,21 @@ class Left:
 
     long: Tangent
     short: Tangent
-    short_fit: Fit
     growth: Growth
     learnt: tuple[Learnt, ...]
     share: float
     lack: Lack | None = None
 
     @property
+    def best(self) -> Learnt | None:
+        """Where most is learnt."""
+        return max(self.learnt, key=lambda k: k.share, default=None)
+
+    @property
     def coherent(self) -> bool:
         """Is it more than noise, whatever its colour?"""
-        best = max((k.share for k in self.learnt), default=0.0)
         # In strongly coloured noise a regression may find a tenth by chance, but then nothing grows.
-        learnt = best > (LEARNT if self.growth.sigmas > 2 else PLENTY)
+        learnt = self.best is not None and self.best.share > (LEARNT if self.growth.sigmas > 2 else PLENTY)
         return self.growth.sigmas > SIGMAS or self.growth.chi_short > COARSE or learnt
 
     @property
@@ -66,27 +69,20 @@ class Left:
         return self.coherent and self.share > SLIGHT
 
 
-def shortened(last: Fit, long: Windows) -> tuple[Windows, Fit]:
-    """The same hypothesis on short windows."""
-    m = long.measured
-    windows = m.windows(min(m.brief(SHORT), long.length))
-    return windows, rescued(fit(last.hypothesis, windows, theta=last.theta, iterations=5), windows)
-
-
 def left(model: Model, last: Fit, windows: Windows, seed: int = 0) -> Left:
     """What the final fit leaves; model: with the causes at their fitted numbers, for slopes and for the force of the effort."""
-    last = rescued(last, windows)
-    brief, short_fit = shortened(last, windows)
-    long, short = Tangent.of(model, windows, last), Tangent.of(model, brief, short_fit)
-    found = _judged(long, short, last, short_fit, seed)
-    if found.remains and windows.measured.rough.any():
-        smooth = _judged(_smoothed(long), _smoothed(short), last, short_fit, seed)
+    last, m = rescued(last, windows), windows.measured
+    brief = m.windows(min(m.brief(SHORT), windows.length))
+    again = rescued(fit(last.hypothesis, brief, theta=last.theta, iterations=5), brief)
+    long, short = Tangent.of(model, windows, last), Tangent.of(model, brief, again)
+    found = _judged(long, short, seed)
+    if found.remains and m.rough.any():
+        smooth = _judged(_smoothed(long), _smoothed(short), seed)
         found = found if smooth.remains else smooth
     return found
 
 
-def _judged(long: Tangent, short: Tangent, last: Fit, short_fit: Fit, seed: int) -> Left:
-    """last, short_fit: the fits that these residuals are of."""
+def _judged(long: Tangent, short: Tangent, seed: int) -> Left:
     grown, coordinates = growth(long, short, seed), long.model.sites("coordinate")
     # What is at the white noise floor holds nothing to learn.
     sites = coordinates if grown.chi_long > FLOOR else ()
@@ -96,10 +92,10 @@ def _judged(long: Tangent, short: Tangent, last: Fit, short_fit: Fit, seed: int)
     excess = [float(grown.excess.sum()), *(k.share * _square(m) for k, m in both)]
     if grown.chi_short > COARSE:
         excess.append(_square(long))
-    found = Left(long, short, short_fit, grown, learnt, _share(long, coordinates, max(excess)))
-    if not last.hypothesis.charged or (found.coherent and found.share > FAINT):
+    found = Left(long, short, grown, learnt, _share(long, coordinates, max(excess)))
+    if not long.fitted.hypothesis.charged or (found.coherent and found.share > FAINT):
         return found
-    return replace(found, lack=lack(long, short, last, seed))
+    return replace(found, lack=lack(long, short, seed))
 
 
 def _smoothed(motion: Tangent) -> Tangent:
@@ -141,7 +137,7 @@ def doubts(causes: int, found: Left) -> tuple[str, ...]:
     """Why named causes may be stand-ins, as sentences."""
     out = []
     if causes and found.coherent and found.share > FAINT:
-        best = max(found.learnt, key=lambda k: k.share, default=None)
+        best = found.best
         kind = max(best.kinds, key=lambda k: best.kinds[k]) if best and best.share > LEARNT else None
         looks = f"; it looks like {KINDS.get(kind, kind)}" if kind else ""
         size = f"{100 * found.share:.2g} % of the effort" if found.share < BEYOND else "more than any effort here"
@@ -157,8 +153,7 @@ def doubts(causes: int, found: Left) -> tuple[str, ...]:
 
 def unexplained(found: Left) -> Unexplained:
     """The kind of what is left, where it is, single pushes, and a formula where a law of the present state would do."""
-    where = _where(found.short)
-    best = max(found.learnt, key=lambda k: k.share, default=None)
+    where, best = _where(found.short), found.best
     if best is None:
         return Unexplained(False, where=where)
     kinds = {n: share for n, share in best.kinds.items() if share > 0}
@@ -169,7 +164,7 @@ def unexplained(found: Left) -> Unexplained:
         formula = max((f for f in formulas if f is not None), key=lambda f: f.explained, default=None)
         return Unexplained(False, looks_like=kinds, where=where, correction=formula)
     # A push at the edge of a window hides in its free start, so these windows overlap by half.
-    windows, short = found.short.windows, found.short_fit
+    windows, short = found.short.windows, found.short.fitted
     overlapping = windows.measured.windows(windows.length, max(1, windows.length // 2))
     again = fit(short.hypothesis.holding(short.theta), overlapping)
     motion = Tangent.of(found.short.model, overlapping, again)

@@ -9,7 +9,7 @@ from typing import final
 import numpy as np
 
 from gapcert.plugin import EffectParameter
-from gapcert_diagnosis.data.dataset import Windows
+from gapcert_diagnosis.data.dataset import Dataset, Windows
 from gapcert_diagnosis.fitting.fit import Fit
 from gapcert_diagnosis.results import Seen
 
@@ -41,6 +41,19 @@ class Answer:
     rivals: Mapping[tuple[str, str], tuple[Found, ...]]
     negligible: Mapping[tuple[str, str], float]
     plain: Fit | None = None
+
+    @property
+    def library(self) -> Library:
+        return self.search.library
+
+    @property
+    def windows(self) -> Windows:
+        return self.search.windows
+
+    @property
+    def dataset(self) -> Dataset:
+        """Of the windows, with the input held as fits best."""
+        return self.search.windows.measured
 
     @property
     def nothing(self) -> Fit:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
@@ -20,11 +20,11 @@ from gapcert.plugin import (
     Parameter,
     difference,
     position,
-    registry,
     site_units,
 )
 from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.fitting.fit import Hypothesis
+from gapcert_diagnosis.fitting.step_size import built
 from gapcert_diagnosis.results import ORDER
 
 SWEPT = 1000  # points of a range
@@ -304,21 +304,14 @@ def _restated(model: Model, values: Mapping[str, float]) -> Model:
         return own
     spec = model.to_spec()
     stated, units = spec["parameters"], {p.name: p.unit for p in model.parameters}
-    return _built(spec | {"parameters": stated | {n: {**stated[n], "value": f"{v!r} {units[n]}"} for n, v in values.items()}})
-
-
-def _built(spec: Mapping[str, Any]) -> Model:
-    known = registry()
-    section: Any = known.config("model", spec["kind"])
-    model: Model = known.build("model", spec["kind"], section.model_validate(spec))
-    return model
+    return built(spec | {"parameters": stated | {n: {**stated[n], "value": f"{v!r} {units[n]}"} for n, v in values.items()}})
 
 
 def sliding(model: Model, site: str, x: Array, u: Array, plain: Array | None = None) -> Array:
     """∂x⁺/∂f (n, nx) of the machine as it slides: what turns a change of the state into a force, also where friction holds."""
     spec = model.to_spec()
     if spec.get("dry_friction"):
-        return probe(_built({**spec, "dry_friction": {}}), site, x, u)
+        return probe(built({**spec, "dry_friction": {}}), site, x, u)
     return probe(model, site, x, u, plain)
 
 

@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from gapcert.contracts.systems.system import Model
 
 KINDS = ("model", "backend", "gap_family", "lipschitz", "synthesizer", "effect", "reader", "executor", "observer")
-INNER = ("automaton", "command", "contract", "illustrator", "report", "route", "section", "study", "view")
+INNER = ("automaton", "command", "contract", "diagnoser", "illustrator", "report", "route", "section", "study", "view")
 """Kinds that are no `kind:` of a spec. An `automaton` reads a text as one; a `command` is `function(options) -> Answer`; a
-`contract` is a class of checks for `gapcert.testing`; an `illustrator` adds figures to events, as `make(folder, emit)`, an
-Emit; a `report` makes a page of a run folder; a `route` turns a band into a claim; a `section` is a key of specs, and a
-`study` carries one out; a `view` shows the results of a class.
+`contract` is a class of checks for `gapcert.testing`; a `diagnoser` says why models of its own sort are wrong; an `illustrator`
+adds figures to events, as `make(folder, emit)`, an Emit; a `report` makes a page of a run folder; a `route` turns a band into a
+claim; a `section` is a key of specs, and a `study` carries one out; a `view` shows the results of a class.
 """
 
 
