@@ -8,7 +8,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,9 @@ from .programs.jets import JET, Jet
 from .programs.tape import Table, Tape
 from .programs.trace import Program, trace
 from .programs.unmoved import unmoved
+
+if TYPE_CHECKING:
+    from .programs.rollouts import Compiled
 
 _CHUNK = 1 << 15
 _NEAR = 1e-9
@@ -127,11 +130,9 @@ class EquationsModel(Model):
         every: int = 1,
     ) -> Step:
         """By the compiled interpreter where numba is installed, else as every model does it."""
-        if importlib.util.find_spec("numba") is None:
+        if (compiled := self._compiled()) is None:
             return super().fast_rollout(x0, u, parameters=parameters, hidden=hidden, every=every)
-        from .programs.rollouts import rollout
-
-        return rollout(self, x0, u, parameters or {}, hidden, every)
+        return compiled.rollout(x0, u, parameters or {}, hidden, every)
 
     def along(
         self,
@@ -142,21 +143,22 @@ class EquationsModel(Model):
         hidden: Array | None = None,
     ) -> Array:
         """By the compiled interpreter where numba is installed, else as every model does it."""
-        if not x.size or importlib.util.find_spec("numba") is None:
+        if not x.size or (compiled := self._compiled()) is None:
             return super().along(x, u, parameters=parameters, hidden=hidden)
-        from .programs.rollouts import rollout
-
-        return np.asarray(rollout(self, x[:, 0], u, parameters or {}, hidden, path=x).x[:, 1:])
+        return np.asarray(compiled.rollout(x[:, 0], u, parameters or {}, hidden, path=x).x[:, 1:])
 
     def fast_memories(
         self, path: Array, u: Array, stops: Sequence[int], parameters: Mapping[str, Array | float], hidden: Array
     ) -> Array | None:
         """By the compiled interpreter where numba is installed."""
+        return None if (compiled := self._compiled()) is None else compiled.memories(path, u, stops, parameters, hidden)
+
+    def _compiled(self) -> Compiled | None:
         if importlib.util.find_spec("numba") is None:
             return None
-        from .programs.rollouts import memories
+        from .programs.rollouts import Compiled
 
-        return memories(self, path, u, stops, parameters, hidden)
+        return Compiled(self.program, self.nx, self.nu, self.substeps, self.parameters, self.hidden_default, self.late)
 
     @cached_property
     def program(self) -> Program:
