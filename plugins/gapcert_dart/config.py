@@ -65,6 +65,4 @@ class DartConfig(EngineConfig):
                 "lcp_solver": SOLVERS,
                 "split_impulse": (False, True),
             }
-        return super().settings() | {
-            name: tuple(v for v in values if v != getattr(self, name)) for name, values in candidates.items()
-        }
+        return super().settings() | self.others(candidates)

@@ -82,6 +82,4 @@ class DrakeConfig(EngineConfig):
         if self.touches:
             candidates |= {"friction": (0.5, 1.0), "contact_model": ("point", "hydroelastic_with_fallback")}
             candidates |= {"contact_approximation": APPROXIMATIONS} if self.discrete else {}
-        return super().settings() | {
-            name: tuple(v for v in values if v != getattr(self, name)) for name, values in candidates.items()
-        }
+        return super().settings() | self.others(candidates)

@@ -20,6 +20,7 @@ _HOME = homes(
         "gapcert_engines.robot.shapes": "file_shapes",
         "gapcert_engines.robot.xml_patch": "RobotText",
         "gapcert_engines.silence": "muted",
+        "gapcert_engines.wiring": "check_ranges step_period",
     }
 )
 

@@ -22,3 +22,5 @@ from gapcert_engines.robot.links import as_section as as_section
 from gapcert_engines.robot.shapes import file_shapes as file_shapes
 from gapcert_engines.robot.xml_patch import RobotText as RobotText
 from gapcert_engines.silence import muted as muted
+from gapcert_engines.wiring import check_ranges as check_ranges
+from gapcert_engines.wiring import step_period as step_period

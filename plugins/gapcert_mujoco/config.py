@@ -50,17 +50,15 @@ class MuJoCoConfig(EngineConfig):
 
     def settings(self) -> dict[str, tuple[Any, ...]]:
         """Integrator, sub-steps, damping, friction and the contact solver: what most often separates MuJoCo from another."""
-        candidates: dict[str, tuple[Any, ...]] = {
-            "integrator": ("Euler", "implicitfast", "implicit", "RK4"),
-            "euler_damping": ("explicit", "implicit"),
-            "joint_damping": (0.0,),
-            "frictionloss": (0.0,),
-            "armature": (0.0,),
-            "cone": ("elliptic", "pyramidal"),
-            "impratio": (1.0, 10.0, 100.0),
-            "noslip_iterations": (0, 5),
-        }
-        here = {name: getattr(self, name) for name in candidates}
-        return super().settings() | {
-            name: tuple(v for v in values if v != here[name]) for name, values in candidates.items() if values != (here[name],)
-        }
+        return super().settings() | self.others(
+            {
+                "integrator": ("Euler", "implicitfast", "implicit", "RK4"),
+                "euler_damping": ("explicit", "implicit"),
+                "joint_damping": (0.0,),
+                "frictionloss": (0.0,),
+                "armature": (0.0,),
+                "cone": ("elliptic", "pyramidal"),
+                "impratio": (1.0, 10.0, 100.0),
+                "noslip_iterations": (0, 5),
+            }
+        )
