@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array, Context, Interval, MissingDependency, Model, StateSpec, UsageError
-from gapcert.plugin import Extension, Step
+from gapcert.plugin import Extension, Step, Values
 
 from .build import Definition, define
 from .config import EquationsConfig
@@ -121,35 +121,20 @@ class EquationsModel(Model):
         return Step(np.ascontiguousarray(out.transpose(2, 0, 1)), None if past is None else stacked(past, n))
 
     def fast_rollout(
-        self,
-        x0: Array,
-        u: Array,
-        *,
-        parameters: Mapping[str, Array | float] | None = None,
-        hidden: Array | None = None,
-        every: int = 1,
+        self, x0: Array, u: Array, *, parameters: Values | None = None, hidden: Array | None = None, every: int = 1
     ) -> Step:
         """By the compiled interpreter where numba is installed, else as every model does it."""
         if (compiled := self._compiled()) is None:
             return super().fast_rollout(x0, u, parameters=parameters, hidden=hidden, every=every)
         return compiled.rollout(x0, u, parameters or {}, hidden, every)
 
-    def along(
-        self,
-        x: Array,
-        u: Array,
-        *,
-        parameters: Mapping[str, Array | float] | None = None,
-        hidden: Array | None = None,
-    ) -> Array:
+    def along(self, x: Array, u: Array, *, parameters: Values | None = None, hidden: Array | None = None) -> Array:
         """By the compiled interpreter where numba is installed, else as every model does it."""
         if not x.size or (compiled := self._compiled()) is None:
             return super().along(x, u, parameters=parameters, hidden=hidden)
         return np.asarray(compiled.rollout(x[:, 0], u, parameters or {}, hidden, path=x).x[:, 1:])
 
-    def fast_memories(
-        self, path: Array, u: Array, stops: Sequence[int], parameters: Mapping[str, Array | float], hidden: Array
-    ) -> Array | None:
+    def fast_memories(self, path: Array, u: Array, stops: Sequence[int], parameters: Values, hidden: Array) -> Array | None:
         """By the compiled interpreter where numba is installed."""
         return None if (compiled := self._compiled()) is None else compiled.memories(path, u, stops, parameters, hidden)
 
@@ -212,7 +197,7 @@ class EquationsModel(Model):
             return super().curvature_enclosure(z, axis)
         return Interval.concatenate([self._bend(z[k : k + _CHUNK], axis) for k in range(0, max(len(z), 1), _CHUNK)])
 
-    def output(self, x: Array, u: Array, parameters: Mapping[str, Array | float] | None = None) -> Array:
+    def output(self, x: Array, u: Array, parameters: Values | None = None) -> Array:
         """`outputs` of the section; by default the state. parameters: a number each, or one per row."""
         tape = self.definition.output
         if tape is None:
@@ -225,7 +210,7 @@ class EquationsModel(Model):
             values = tape.run(ARRAY, tape.prepare(ARRAY, known), [*split(np.concatenate([x, u], axis=1)), *unseen])
         return stacked([0.0 if v is None else v for v in values], len(x))
 
-    def output_delays(self, parameters: Mapping[str, Array | float] | None = None) -> Array:
+    def output_delays(self, parameters: Values | None = None) -> Array:
         """Seconds by which each output shows the past, at the given values of parameters: (ny,), or (n, ny)."""
         late = self.definition.output_delays
         given = {k: np.asarray(v, dtype=np.float64) for k, v in (parameters or {}).items()}

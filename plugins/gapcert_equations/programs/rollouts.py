@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
 
 from gapcert import Array, Parameter, UsageError
-from gapcert.plugin import Step
+from gapcert.plugin import Step, Values
 
 from .machine import run
 from .trace import Codes, Program
@@ -31,13 +31,7 @@ class Compiled:
     late: Callable[[list[Any]], Late]
 
     def rollout(
-        self,
-        x0: Array,
-        u: Array,
-        parameters: Mapping[str, Array | float],
-        hidden: Array | None,
-        every: int = 1,
-        path: Array | None = None,
+        self, x0: Array, u: Array, parameters: Values, hidden: Array | None, every: int = 1, path: Array | None = None
     ) -> Step:
         """See Model.fast_rollout; with `path` (n, T, nx), Model.along in all but the first state."""
         late, past, lines, values = self._prepared(x0, u, parameters, hidden)
@@ -49,9 +43,7 @@ class Compiled:
             return Step(x)
         return Step(x, np.concatenate([_remembered(late, u, past, u.shape[1]), last[:, self.nx :]], axis=1))
 
-    def memories(
-        self, path: Array, u: Array, stops: Sequence[int], parameters: Mapping[str, Array | float], hidden: Array
-    ) -> Array:
+    def memories(self, path: Array, u: Array, stops: Sequence[int], parameters: Values, hidden: Array) -> Array:
         """See Model.fast_memories."""
         n, w = len(hidden), len(u)
         known = np.isfinite(path)
@@ -71,7 +63,7 @@ class Compiled:
         return np.concatenate([np.stack(lagged, axis=1), explicit], axis=2)
 
     def _prepared(
-        self, x0: Array, u: Array, parameters: Mapping[str, Array | float], hidden: Array | None
+        self, x0: Array, u: Array, parameters: Values, hidden: Array | None
     ) -> tuple[Late, Array, tuple[Codes, Array, Array], list[Any]]:
         """Late inputs, hidden states (n, nh), what the interpreter must know of late inputs, and parameters; or UsageError."""
         n, w, nu, nh = len(x0), len(u), u.shape[-1], len(self.hidden_default)
