@@ -6,9 +6,8 @@ from typing import Annotated, Any, Literal, final
 
 from pydantic import Field, FiniteFloat
 
-from gapcert_engines import EngineConfig
+from gapcert_engines import Coefficient, EngineConfig
 
-Coefficient = Annotated[FiniteFloat, Field(ge=0)]
 DETECTORS = ("fcl", "dart", "bullet", "ode")
 SOLVERS = ("dantzig", "pgs", "nsgs", "fbf")
 

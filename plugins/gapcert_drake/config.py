@@ -6,9 +6,8 @@ from typing import Annotated, Any, Literal, final
 
 from pydantic import Field, FiniteFloat, model_validator
 
-from gapcert_engines import EngineConfig
+from gapcert_engines import Coefficient, EngineConfig
 
-Coefficient = Annotated[FiniteFloat, Field(ge=0)]
 FIXED_STEP = ("explicit_euler", "semi_explicit_euler", "runge_kutta2")
 """Integrators without control of their error: one step per sub-step."""
 APPROXIMATIONS = ("lagged", "similar", "sap", "tamsi")

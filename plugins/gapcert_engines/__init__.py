@@ -9,8 +9,8 @@ from gapcert.plugin import LazyPackage, homes
 _HOME = homes(
     {
         "gapcert_engines.backend": "EngineBackend as_backend",
-        "gapcert_engines.config": "EngineConfig",
-        "gapcert_engines.contract": "BodyInertia Engine EngineWorld Joint Motor Thruster",
+        "gapcert_engines.config": "Coefficient EngineConfig",
+        "gapcert_engines.contract": "ABSURD BodyInertia Engine EngineWorld Joint JointType Motor Thruster",
         "gapcert_engines.drive": "Drive",
         "gapcert_engines.equations_model": "PHYSICAL EngineModel",
         "gapcert_engines.native_model": "Group NativeModel",

@@ -137,10 +137,7 @@ class FmuBackend(Backend):
         found, out = Numbers(self._wiring.reads), np.empty((len(table), len(self._wiring.reads)))
         for k, row in enumerate(table):
             try:
-                instance.begin()
-                numbers.values[:] = row
-                instance.set(numbers)
-                instance.start()
+                instance.start_at(numbers, row)
                 self._through(instance, self.config.time, periods)
                 instance.get(found)
             except (FMICallException, UsageError) as error:
@@ -215,16 +212,12 @@ class FmuBackend(Backend):
         instance, found = self._make(self._restart), Numbers(self._wiring.reads)
         try:
             for row in self._few():
-                numbers = Numbers(self._wiring.writes)
-                instance.begin()
-                numbers.values[:] = row
-                instance.set(numbers)
-                instance.start()
+                instance.start_at(Numbers(self._wiring.writes), row)
                 instance.get(found)
                 wanted = row[: len(self._wiring.reads)]
                 if (off := np.abs(found.values - wanted) > 1e-12 * np.maximum(np.abs(wanted), 1.0)).any():
                     j = int(np.argmax(off))
-                    name = (*(s.name for s in self.states), *(h.name for h in self.hidden))[j]
+                    name = (*self.states, *self.hidden)[j].name
                     raise UsageError(
                         f"backend.states: {name} was started at {wanted[j]:.9g}, and is {found.values[j]:.9g} when the FMU is "
                         f"initialised; expected a variable that keeps its start value"
@@ -264,11 +257,8 @@ class FmuBackend(Backend):
             if instance.exchanges:
                 row = np.concatenate([state, inputs[0]])
                 return {len(inputs) - 1: self._answers(instance, row[None], [], len(inputs))[0]}
-            seen, start = dict[int, Array](), Numbers(self._wiring.writes)
-            instance.begin()
-            start.values[:] = np.concatenate([state, inputs[0]])
-            instance.set(start)
-            instance.start()
+            seen = dict[int, Array]()
+            instance.start_at(Numbers(self._wiring.writes), np.concatenate([state, inputs[0]]))
             for k, u in enumerate(inputs):
                 pushes.values[:] = u
                 instance.set(pushes)
@@ -286,7 +276,7 @@ class FmuBackend(Backend):
         if (miss <= limit).all():
             return
         j = int(np.argmax(miss))
-        name = (*(s.name for s in self.states), *(h.name for h in self.hidden))[j]
+        name = (*self.states, *self.hidden)[j].name
         raise UsageError(
             f"backend.states: the FMU remembers more than its states, or looks at the clock: after {periods} periods it has "
             f"{name} = {on[j]:.9g} when it goes on, and {anew[j]:.9g} when it starts again from its states; name what "
