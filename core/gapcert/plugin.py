@@ -48,7 +48,8 @@ _HOME = homes(
         "gapcert.contracts.systems.region": "TURN Ellipsoid Polytope Region turned",
         "gapcert.contracts.systems.scene": "GREY Scene Shape at_rest",
         "gapcert.contracts.systems.system": (
-            "Backend Capability EngineHints Extendable Model StateSpec Step System Variant cross difference rotated step_seed"
+            "Backend Capability EngineHints Extendable Model StateSpec Step System Values Variant cross difference rotated "
+            "step_seed"
         ),
         "gapcert.lazy": "LazyPackage homes",
         "gapcert.numerics": "order_statistics",

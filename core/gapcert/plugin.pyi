@@ -125,6 +125,7 @@ from gapcert.contracts.systems.system import Model as Model
 from gapcert.contracts.systems.system import StateSpec as StateSpec
 from gapcert.contracts.systems.system import Step as Step
 from gapcert.contracts.systems.system import System as System
+from gapcert.contracts.systems.system import Values as Values
 from gapcert.contracts.systems.system import Variant as Variant
 from gapcert.contracts.systems.system import cross as cross
 from gapcert.contracts.systems.system import difference as difference

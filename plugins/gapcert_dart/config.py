@@ -6,9 +6,8 @@ from typing import Annotated, Any, Literal, final
 
 from pydantic import Field, FiniteFloat
 
-from gapcert_engines import EngineConfig
+from gapcert_engines import Coefficient, EngineConfig
 
-Coefficient = Annotated[FiniteFloat, Field(ge=0)]
 DETECTORS = ("fcl", "dart", "bullet", "ode")
 SOLVERS = ("dantzig", "pgs", "nsgs", "fbf")
 
@@ -65,6 +64,4 @@ class DartConfig(EngineConfig):
                 "lcp_solver": SOLVERS,
                 "split_impulse": (False, True),
             }
-        return super().settings() | {
-            name: tuple(v for v in values if v != getattr(self, name)) for name, values in candidates.items()
-        }
+        return super().settings() | self.others(candidates)

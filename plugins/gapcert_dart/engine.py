@@ -12,13 +12,13 @@ import numpy as np
 
 from gapcert import Array, Parameter
 from gapcert.plugin import Scene
-from gapcert_engines import Drive, Engine, Joint, as_backend, as_section
+from gapcert_engines import Drive, Engine, Joint, as_backend, as_section, file_shapes
 
 from .config import DartConfig
-from .drawn import scene
 from .loader import joints, load
 from .patch import files
 from .robot import RobotFile
+from .rotation import to_vector
 from .section import links
 from .world import GRAVITY, DartWorld, inertia, moving_bodies, restitution
 
@@ -81,7 +81,22 @@ class DartEngine(Engine):
         return files(self.robot, self.config, values, {p.name: p.value for p in self.parameters})
 
     def scene(self, position: Array, base: Array | None) -> Scene:
-        return scene(self.robot, self.config, position, base)
+        skeleton = load(self.robot, fixed_base=self.config.fixed_base)
+        bodies = skeleton.getBodyNodes()
+        names = [body.getName() for body in bodies]
+        shapes = file_shapes(self.robot.element(), self.robot.path.parent, names)
+        places = [native.getIndexInSkeleton(0) for joint, native in joints(self.robot, skeleton) if joint.movable]
+        poses, q = np.empty((len(position), len(names), 7)), skeleton.getPositions()
+        for k, row in enumerate(position):
+            q[places] = row
+            if base is not None:
+                q[:3], q[3:6] = to_vector(base[k : k + 1, 3:7])[0], base[k, :3]
+            skeleton.setPositions(q)
+            for j, body in enumerate(bodies):
+                place = body.getWorldTransform()
+                poses[k, j] = [*place.translation(), *place.quaternion().wxyz()]
+        found = Scene(tuple(names), shapes, poses)
+        return found if self.config.ground is None else found.with_ground()
 
     def tiles(self) -> tuple[int, str]:
         if not self.config.fixed_base:

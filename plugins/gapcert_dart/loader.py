@@ -5,19 +5,18 @@ from __future__ import annotations
 import re
 import tempfile
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import dartpy
 import numpy as np
 
 from gapcert import UsageError
-from gapcert_engines import Joint, muted
+from gapcert_engines import Joint, JointType, muted
 
 from .robot import RobotFile
 
 __all__ = ["dartpy", "joints", "load"]
 
-JointType = Literal["revolute", "prismatic", "fixed", "ball", "planar", "free", "other"]
 _TYPES: dict[str, JointType] = {
     "RevoluteJoint": "revolute",
     "PrismaticJoint": "prismatic",

@@ -8,7 +8,7 @@ from typing import Any, final
 import numpy as np
 
 from gapcert import Array, UsageError
-from gapcert_engines import BodyInertia, Drive, EngineWorld
+from gapcert_engines import ABSURD, BodyInertia, Drive, EngineWorld
 
 from .config import DartConfig
 from .driving import Driver
@@ -20,9 +20,6 @@ GRAVITY = tuple(float(g) for g in dartpy.simulation.World().getGravity())
 """DART's own, m/s²."""
 GROUND_SIZE = (1000.0, 1000.0, 10.0)
 """m; a box, because DART finds all corners of a box on a box, and one on a plane."""
-
-ABSURD = 1e100
-"""No position or velocity of a robot, in any unit; its square is still finite."""
 
 
 @final

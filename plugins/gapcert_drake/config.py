@@ -6,9 +6,8 @@ from typing import Annotated, Any, Literal, final
 
 from pydantic import Field, FiniteFloat, model_validator
 
-from gapcert_engines import EngineConfig
+from gapcert_engines import Coefficient, EngineConfig
 
-Coefficient = Annotated[FiniteFloat, Field(ge=0)]
 FIXED_STEP = ("explicit_euler", "semi_explicit_euler", "runge_kutta2")
 """Integrators without control of their error: one step per sub-step."""
 APPROXIMATIONS = ("lagged", "similar", "sap", "tamsi")
@@ -82,6 +81,4 @@ class DrakeConfig(EngineConfig):
         if self.touches:
             candidates |= {"friction": (0.5, 1.0), "contact_model": ("point", "hydroelastic_with_fallback")}
             candidates |= {"contact_approximation": APPROXIMATIONS} if self.discrete else {}
-        return super().settings() | {
-            name: tuple(v for v in values if v != getattr(self, name)) for name, values in candidates.items()
-        }
+        return super().settings() | self.others(candidates)

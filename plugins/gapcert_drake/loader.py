@@ -6,7 +6,7 @@ import contextlib
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, final
+from typing import Any, final
 
 from pydrake import geometry
 from pydrake.math import RigidTransform
@@ -16,12 +16,11 @@ from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import DiagramBuilder
 
 from gapcert import UsageError
-from gapcert_engines import Joint
+from gapcert_engines import Joint, JointType
 
 from .config import DrakeConfig
 from .robot import ADDED, RobotFile, harmless
 
-JointType = Literal["revolute", "prismatic", "fixed", "ball", "planar", "free", "other"]
 _TYPES: dict[str, JointType] = {
     "revolute": "revolute",
     "prismatic": "prismatic",

@@ -10,15 +10,12 @@ from pydrake.multibody.tree import RotationalInertia, SpatialInertia
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 
 from gapcert import Array, UsageError
-from gapcert_engines import BodyInertia, Drive, EngineWorld
+from gapcert_engines import ABSURD, BodyInertia, Drive, EngineWorld
 
 from .config import FIXED_STEP, DrakeConfig
 from .loader import Loaded, listening, load
 from .robot import RobotFile
 from .section import central
-
-ABSURD = 1e100
-"""No position or velocity of a robot, in any unit; its square is still finite."""
 
 
 @final

@@ -9,8 +9,8 @@ from gapcert.plugin import LazyPackage, homes
 _HOME = homes(
     {
         "gapcert_engines.backend": "EngineBackend as_backend",
-        "gapcert_engines.config": "EngineConfig",
-        "gapcert_engines.contract": "BodyInertia Engine EngineWorld Joint Motor Thruster",
+        "gapcert_engines.config": "Coefficient EngineConfig",
+        "gapcert_engines.contract": "ABSURD BodyInertia Engine EngineWorld Joint JointType Motor Thruster",
         "gapcert_engines.drive": "Drive",
         "gapcert_engines.equations_model": "PHYSICAL EngineModel",
         "gapcert_engines.native_model": "Group NativeModel",
@@ -21,6 +21,7 @@ _HOME = homes(
         "gapcert_engines.robot.xml_patch": "RobotText",
         "gapcert_engines.settings": "Options changed declared flat plain short",
         "gapcert_engines.silence": "muted",
+        "gapcert_engines.wiring": "check_ranges step_period",
     }
 )
 

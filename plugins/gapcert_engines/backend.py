@@ -17,7 +17,7 @@ from gapcert.plugin import Array, Backend, Capability, Context, Parameter, Scene
 
 from .config import EngineConfig
 from .contract import ENDLESS, Engine, EngineWorld, Joint
-from .wiring import Lever, from_columns, step_period, to_columns, wire
+from .wiring import Lever, check_ranges, from_columns, step_period, to_columns, wire
 
 
 def as_backend(engine: Callable[[Any, Path], Engine], config: EngineConfig, context: Context) -> EngineBackend:
@@ -41,7 +41,7 @@ class EngineBackend(Backend):
         self.engine, self.config = engine, engine.config
         self._lock = threading.Lock()
         self._worlds: dict[int, EngineWorld] = {}
-        self.period, self.substeps = step_period(engine.config, model), engine.config.substeps
+        self.period, self.substeps = step_period(engine.config.period, model), engine.config.substeps
         self._joints = [j for j in engine.joints if j.movable]
         if not self._joints and not engine.base:
             raise UsageError(
@@ -198,13 +198,7 @@ class EngineBackend(Backend):
 
     def _sets(self, parameters: Mapping[str, Array]) -> tuple[list[dict[str, float]], npt.NDArray[np.intp]]:
         """The sets of parameter values that differ, and which of them each row has."""
-        for p in self.parameters:
-            value = parameters.get(p.name)
-            if value is not None and ((value < p.low) | (value > p.high)).any():
-                bad = float(value[(value < p.low) | (value > p.high)][0])
-                raise UsageError(
-                    f"{type(self.engine).__name__}: parameter {p.name} = {bad}; expected a number in [{p.low}, {p.high}]"
-                )
+        check_ranges(type(self.engine).__name__, self.parameters, parameters)
         table = np.stack(list(parameters.values()), axis=1)
         if len(table) and (table == table[0]).all():
             rows, group = table[:1], np.zeros(len(table), dtype=np.intp)

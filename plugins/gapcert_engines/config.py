@@ -79,6 +79,11 @@ class EngineConfig(BaseModel, ABC):
         """Values worth trying when this engine disagrees with another: dotted option → candidates (a mapping sets several)."""
         return {"substeps": tuple(k for k in (1, 2, 5, 10) if k != self.substeps)}
 
+    def others(self, candidates: dict[str, tuple[Any, ...]]) -> dict[str, tuple[Any, ...]]:
+        """Of candidates by option those that this section does not have already."""
+        left = {name: tuple(v for v in values if v != getattr(self, name)) for name, values in candidates.items()}
+        return {name: values for name, values in left.items() if values}
+
     @field_validator("states")
     @classmethod
     def _fields(cls, states: dict[str, str]) -> dict[str, str]:

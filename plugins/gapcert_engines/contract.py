@@ -33,6 +33,8 @@ NATIVE_UNITS = {
     True: {"damping": "N*s/m", "dry": "N", "armature": "kg", "stiffness": "N/m", "rest": "m"},
 }
 """Of what joints have, by whether they slide."""
+ABSURD = 1e100
+"""No position or velocity of a robot, in any unit; its square is still finite."""
 LIGHTEST = 1e-9
 """kg; a body without any mass makes its joint's acceleration undefined."""
 

@@ -11,7 +11,7 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.plugin import Array, StateSpec, System, UsageError, magnitude
+from gapcert.plugin import Array, Parameter, StateSpec, System, UsageError, magnitude
 
 from .config import FEEDBACK, EngineConfig, seconds
 from .contract import BASE, BASE_EULER, Engine, Joint, Motor, Thruster
@@ -241,10 +241,19 @@ def _check_unit(where: str, spec: StateSpec, unit: str, what: str) -> None:
         )
 
 
-def step_period(config: EngineConfig, model: System | None) -> float:
+def check_ranges(who: str, parameters: Sequence[Parameter], given: Mapping[str, Array]) -> None:
+    """UsageError where a parameter is given a value (n,) outside of its bounds."""
+    for p in parameters:
+        value = given.get(p.name)
+        if value is not None and (outside := (value < p.low) | (value > p.high)).any():
+            bad = float(value[outside][0])
+            raise UsageError(f"{who}: parameter {p.name} = {bad}; expected a number in [{p.low}, {p.high}]")
+
+
+def step_period(period: str | None, model: System | None) -> float:
     """Seconds per step: the spec's, else the model's."""
-    if config.period is not None:
-        return seconds(config.period)
+    if period is not None:
+        return seconds(period)
     if model is None:
         raise UsageError("backend.period: there is no model to take it from; add for instance period: 5 ms")
     return model.period

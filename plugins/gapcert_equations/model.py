@@ -8,13 +8,13 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array, Context, Interval, MissingDependency, Model, StateSpec, UsageError
-from gapcert.plugin import Extension, Step
+from gapcert.plugin import Extension, Step, Values
 
 from .build import Definition, define
 from .config import EquationsConfig
@@ -26,6 +26,9 @@ from .programs.jets import JET, Jet
 from .programs.tape import Table, Tape
 from .programs.trace import Program, trace
 from .programs.unmoved import unmoved
+
+if TYPE_CHECKING:
+    from .programs.rollouts import Compiled
 
 _CHUNK = 1 << 15
 _NEAR = 1e-9
@@ -118,45 +121,29 @@ class EquationsModel(Model):
         return Step(np.ascontiguousarray(out.transpose(2, 0, 1)), None if past is None else stacked(past, n))
 
     def fast_rollout(
-        self,
-        x0: Array,
-        u: Array,
-        *,
-        parameters: Mapping[str, Array | float] | None = None,
-        hidden: Array | None = None,
-        every: int = 1,
+        self, x0: Array, u: Array, *, parameters: Values | None = None, hidden: Array | None = None, every: int = 1
     ) -> Step:
         """By the compiled interpreter where numba is installed, else as every model does it."""
-        if importlib.util.find_spec("numba") is None:
+        if (compiled := self._compiled()) is None:
             return super().fast_rollout(x0, u, parameters=parameters, hidden=hidden, every=every)
-        from .programs.rollouts import rollout
+        return compiled.rollout(x0, u, parameters or {}, hidden, every)
 
-        return rollout(self, x0, u, parameters or {}, hidden, every)
-
-    def along(
-        self,
-        x: Array,
-        u: Array,
-        *,
-        parameters: Mapping[str, Array | float] | None = None,
-        hidden: Array | None = None,
-    ) -> Array:
+    def along(self, x: Array, u: Array, *, parameters: Values | None = None, hidden: Array | None = None) -> Array:
         """By the compiled interpreter where numba is installed, else as every model does it."""
-        if not x.size or importlib.util.find_spec("numba") is None:
+        if not x.size or (compiled := self._compiled()) is None:
             return super().along(x, u, parameters=parameters, hidden=hidden)
-        from .programs.rollouts import rollout
+        return np.asarray(compiled.rollout(x[:, 0], u, parameters or {}, hidden, path=x).x[:, 1:])
 
-        return np.asarray(rollout(self, x[:, 0], u, parameters or {}, hidden, path=x).x[:, 1:])
-
-    def fast_memories(
-        self, path: Array, u: Array, stops: Sequence[int], parameters: Mapping[str, Array | float], hidden: Array
-    ) -> Array | None:
+    def fast_memories(self, path: Array, u: Array, stops: Sequence[int], parameters: Values, hidden: Array) -> Array | None:
         """By the compiled interpreter where numba is installed."""
+        return None if (compiled := self._compiled()) is None else compiled.memories(path, u, stops, parameters, hidden)
+
+    def _compiled(self) -> Compiled | None:
         if importlib.util.find_spec("numba") is None:
             return None
-        from .programs.rollouts import memories
+        from .programs.rollouts import Compiled
 
-        return memories(self, path, u, stops, parameters, hidden)
+        return Compiled(self.program, self.nx, self.nu, self.substeps, self.parameters, self.hidden_default, self.late)
 
     @cached_property
     def program(self) -> Program:
@@ -210,7 +197,7 @@ class EquationsModel(Model):
             return super().curvature_enclosure(z, axis)
         return Interval.concatenate([self._bend(z[k : k + _CHUNK], axis) for k in range(0, max(len(z), 1), _CHUNK)])
 
-    def output(self, x: Array, u: Array, parameters: Mapping[str, Array | float] | None = None) -> Array:
+    def output(self, x: Array, u: Array, parameters: Values | None = None) -> Array:
         """`outputs` of the section; by default the state. parameters: a number each, or one per row."""
         tape = self.definition.output
         if tape is None:
@@ -223,7 +210,7 @@ class EquationsModel(Model):
             values = tape.run(ARRAY, tape.prepare(ARRAY, known), [*split(np.concatenate([x, u], axis=1)), *unseen])
         return stacked([0.0 if v is None else v for v in values], len(x))
 
-    def output_delays(self, parameters: Mapping[str, Array | float] | None = None) -> Array:
+    def output_delays(self, parameters: Values | None = None) -> Array:
         """Seconds by which each output shows the past, at the given values of parameters: (ny,), or (n, ny)."""
         late = self.definition.output_delays
         given = {k: np.asarray(v, dtype=np.float64) for k, v in (parameters or {}).items()}

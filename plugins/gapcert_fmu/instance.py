@@ -96,6 +96,13 @@ class Instance:
         """Ends the initialization."""
         self.fmu.exitInitializationMode()
 
+    def start_at(self, numbers: Numbers, values: Array) -> None:
+        """As if it were new, with these values of some variables, and initialised."""
+        numbers.values[:] = values
+        self.begin()
+        self.set(numbers)
+        self.start()
+
     def advance(self, time: float, step: float) -> None:
         """One communication step of co-simulation."""
         # With a snapshot the FMU has to be ready to go back.

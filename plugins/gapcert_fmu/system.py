@@ -17,8 +17,8 @@ import numpy as np
 from fmpy.fmi1 import FMICallException
 
 from gapcert import Array, Backend, Context, System, UsageError
-from gapcert.plugin import Step, magnitude
-from gapcert_engines import muted
+from gapcert.plugin import Step
+from gapcert_engines import check_ranges, muted, step_period
 
 from .archive import unpack
 from .config import FmuConfig
@@ -48,7 +48,7 @@ class FmuBackend(Backend):
         self._lock = threading.Lock()
         self._sha = _sha(self.file)
         self._open()
-        self.period = magnitude(config.period, "s") if config.period is not None else _period(model)
+        self.period = step_period(config.period, model)
         self.substeps = config.substeps
         self._wiring = w = wire(config, self.description, model)
         self.states, self.inputs, self.hidden, self.parameters = w.states, w.inputs, w.hidden, w.parameters
@@ -119,7 +119,7 @@ class FmuBackend(Backend):
 
     def _step(self, x: Array, u: Array, **options: Any) -> Step:
         given: dict[str, Array] = dict(options.get("parameters", {}))
-        self._check_range(given)
+        check_ranges(type(self).__name__, self.parameters, given)
         table = np.concatenate(
             [x, options.get("hidden", np.zeros((len(x), 0))), u, *(v[:, None] for v in given.values())], axis=1
         )
@@ -137,10 +137,7 @@ class FmuBackend(Backend):
         found, out = Numbers(self._wiring.reads), np.empty((len(table), len(self._wiring.reads)))
         for k, row in enumerate(table):
             try:
-                instance.begin()
-                numbers.values[:] = row
-                instance.set(numbers)
-                instance.start()
+                instance.start_at(numbers, row)
                 self._through(instance, self.config.time, periods)
                 instance.get(found)
             except (FMICallException, UsageError) as error:
@@ -168,12 +165,6 @@ class FmuBackend(Backend):
         return UsageError(
             f"FmuBackend: {self.file}, from {start}: {str(error).rstrip('.')}{said}; expected it to answer everywhere"
         )
-
-    def _check_range(self, given: dict[str, Array]) -> None:
-        for p in self.parameters:
-            if (value := given.get(p.name)) is not None and ((value < p.low) | (value > p.high)).any():
-                bad = float(value[(value < p.low) | (value > p.high)][0])
-                raise UsageError(f"FmuBackend: parameter {p.name} = {bad}; expected a number in [{p.low}, {p.high}]")
 
     def _make(self, restart: Restart) -> Instance:
         return Instance(self.description, restart, tolerance=self._tolerance, time=self.config.time, preset=self._wiring.preset)
@@ -221,16 +212,12 @@ class FmuBackend(Backend):
         instance, found = self._make(self._restart), Numbers(self._wiring.reads)
         try:
             for row in self._few():
-                numbers = Numbers(self._wiring.writes)
-                instance.begin()
-                numbers.values[:] = row
-                instance.set(numbers)
-                instance.start()
+                instance.start_at(Numbers(self._wiring.writes), row)
                 instance.get(found)
                 wanted = row[: len(self._wiring.reads)]
                 if (off := np.abs(found.values - wanted) > 1e-12 * np.maximum(np.abs(wanted), 1.0)).any():
                     j = int(np.argmax(off))
-                    name = (*(s.name for s in self.states), *(h.name for h in self.hidden))[j]
+                    name = (*self.states, *self.hidden)[j].name
                     raise UsageError(
                         f"backend.states: {name} was started at {wanted[j]:.9g}, and is {found.values[j]:.9g} when the FMU is "
                         f"initialised; expected a variable that keeps its start value"
@@ -270,11 +257,8 @@ class FmuBackend(Backend):
             if instance.exchanges:
                 row = np.concatenate([state, inputs[0]])
                 return {len(inputs) - 1: self._answers(instance, row[None], [], len(inputs))[0]}
-            seen, start = dict[int, Array](), Numbers(self._wiring.writes)
-            instance.begin()
-            start.values[:] = np.concatenate([state, inputs[0]])
-            instance.set(start)
-            instance.start()
+            seen = dict[int, Array]()
+            instance.start_at(Numbers(self._wiring.writes), np.concatenate([state, inputs[0]]))
             for k, u in enumerate(inputs):
                 pushes.values[:] = u
                 instance.set(pushes)
@@ -292,7 +276,7 @@ class FmuBackend(Backend):
         if (miss <= limit).all():
             return
         j = int(np.argmax(miss))
-        name = (*(s.name for s in self.states), *(h.name for h in self.hidden))[j]
+        name = (*self.states, *self.hidden)[j].name
         raise UsageError(
             f"backend.states: the FMU remembers more than its states, or looks at the clock: after {periods} periods it has "
             f"{name} = {on[j]:.9g} when it goes on, and {anew[j]:.9g} when it starts again from its states; name what "
@@ -305,9 +289,3 @@ def _sha(file: str) -> str:
     if not path.is_file():
         raise UsageError(f"file: there is no file {path}; give the path of an FMU, relative to the spec")
     return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def _period(model: System | None) -> float:
-    if model is None:
-        raise UsageError("backend.period: there is no model to take it from; add for instance period: 5 ms")
-    return model.period

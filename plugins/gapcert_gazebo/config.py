@@ -37,7 +37,4 @@ class GazeboConfig(EngineConfig):
 
     def settings(self) -> dict[str, tuple[Any, ...]]:
         """Sub-steps, gravity (SDF's default is 9.8), damping, friction and the contact solver."""
-        here = {name: getattr(self, name) for name in _CANDIDATES}
-        return super().settings() | {
-            name: others for name, values in _CANDIDATES.items() if (others := tuple(v for v in values if v != here[name]))
-        }
+        return super().settings() | self.others(_CANDIDATES)

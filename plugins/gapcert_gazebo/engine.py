@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, final
 
 from gapcert import Array, Context, Parameter, UsageError
 from gapcert.plugin import Scene
-from gapcert_engines import BodyInertia, Drive, Engine, EngineBackend, as_section, patched_file
+from gapcert_engines import BodyInertia, Drive, Engine, EngineBackend, as_section, file_shapes, patched_file
 
 from .config import GazeboConfig
-from .drawn import drawn
 from .sdf import Description, world_text
 from .section import links
 from .shim import shim
@@ -99,7 +99,11 @@ class GazeboEngine(Engine):
             poses = world.poses(position, base, len(self._found.masses))
         finally:
             world.close()
-        return drawn(self._text, Path(self.file).parent, self._found, poses, ground=self.config.ground is not None)
+        names = list(self._found.masses)
+        model = next((m for m in ET.fromstring(self._text).iter("model") if m.get("name") == self._found.model), None)
+        shapes = () if model is None else file_shapes(model, Path(self.file).parent, names)
+        scene = Scene(tuple(names), shapes, poses)
+        return scene if self.config.ground is None else scene.with_ground()
 
     def tiles(self) -> tuple[int, str]:
         return 1, "untiled: Gazebo spends its time on robots, not on worlds, so copies gain little"

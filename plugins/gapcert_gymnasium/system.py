@@ -16,7 +16,7 @@ import numpy as np
 
 from gapcert import Array, Backend, Context, StateSpec, System, UsageError
 from gapcert.plugin import Step, magnitude
-from gapcert_engines import muted
+from gapcert_engines import check_ranges, muted
 
 from .adapters import CLASSIC, OURS, Adapter, Attribute, MuJoCo, Own
 from .config import GymnasiumConfig, Levels
@@ -197,7 +197,7 @@ class GymnasiumBackend(Backend):
         full[:, self._seen] = x
         full[:, self._unseen] = options.get("hidden", 0.0)
         given: dict[str, Array] = dict(options.get("parameters", {}))
-        self._check_range(given)
+        check_ranges(type(self).__name__, self.parameters, given)
         rows = np.stack(list(given.values()), axis=1) if given else None
         out, actions = np.empty_like(full), self._actions(u)
         with self._lock:
@@ -224,9 +224,3 @@ class GymnasiumBackend(Backend):
             self._adapter = self._made()
             self._adapter.set_period(self.period)
         return self._adapter
-
-    def _check_range(self, given: Mapping[str, Array]) -> None:
-        for p in self.parameters:
-            if (value := given.get(p.name)) is not None and ((value < p.low) | (value > p.high)).any():
-                bad = float(value[(value < p.low) | (value > p.high)][0])
-                raise UsageError(f"GymnasiumBackend: parameter {p.name} = {bad}; expected a number in [{p.low}, {p.high}]")

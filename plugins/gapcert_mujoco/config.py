@@ -6,9 +6,8 @@ from typing import Annotated, Any, Literal, final
 
 from pydantic import Field, FiniteFloat
 
-from gapcert_engines import EngineConfig
+from gapcert_engines import Coefficient, EngineConfig
 
-Nonnegative = Annotated[FiniteFloat, Field(ge=0)]
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 
 
@@ -36,31 +35,29 @@ class MuJoCoConfig(EngineConfig):
     iterations: Annotated[int, Field(ge=1)] | None = Field(
         None, description="of the solver, at most; default: the file's, or 100"
     )
-    tolerance: Nonnegative | None = Field(None, description="at which the solver stops; default: the file's, or 1e-8")
+    tolerance: Coefficient | None = Field(None, description="at which the solver stops; default: the file's, or 1e-8")
     cone: Literal["pyramidal", "elliptic"] | None = Field(None, description="friction cone; default: the file's, or pyramidal")
     impratio: Positive | None = Field(
         None, description="impedance of friction to that of the normal force; default: the file's, or 1"
     )
     noslip_iterations: Annotated[int, Field(ge=0)] | None = Field(None, description="default: the file's, or 0")
-    frictionloss: Nonnegative | None = Field(None, description="dry friction of all joints, in N·m or N; default: the file's")
-    armature: Nonnegative | None = Field(None, description="inertia of all joints, in kg·m² or kg; default: the file's")
+    frictionloss: Coefficient | None = Field(None, description="dry friction of all joints, in N·m or N; default: the file's")
+    armature: Coefficient | None = Field(None, description="inertia of all joints, in kg·m² or kg; default: the file's")
     implementation: Literal["c", "mjx"] = Field("c", description="MuJoCo's C code, or MuJoCo XLA")
     tiles: int = Field(default=256, ge=1, description="copies that are stepped at once")
     threads: int = Field(default=1, ge=1, description="threads that share the rows of a query")
 
     def settings(self) -> dict[str, tuple[Any, ...]]:
         """Integrator, sub-steps, damping, friction and the contact solver: what most often separates MuJoCo from another."""
-        candidates: dict[str, tuple[Any, ...]] = {
-            "integrator": ("Euler", "implicitfast", "implicit", "RK4"),
-            "euler_damping": ("explicit", "implicit"),
-            "joint_damping": (0.0,),
-            "frictionloss": (0.0,),
-            "armature": (0.0,),
-            "cone": ("elliptic", "pyramidal"),
-            "impratio": (1.0, 10.0, 100.0),
-            "noslip_iterations": (0, 5),
-        }
-        here = {name: getattr(self, name) for name in candidates}
-        return super().settings() | {
-            name: tuple(v for v in values if v != here[name]) for name, values in candidates.items() if values != (here[name],)
-        }
+        return super().settings() | self.others(
+            {
+                "integrator": ("Euler", "implicitfast", "implicit", "RK4"),
+                "euler_damping": ("explicit", "implicit"),
+                "joint_damping": (0.0,),
+                "frictionloss": (0.0,),
+                "armature": (0.0,),
+                "cone": ("elliptic", "pyramidal"),
+                "impratio": (1.0, 10.0, 100.0),
+                "noslip_iterations": (0, 5),
+            }
+        )

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from gapcert import Array
+from gapcert.plugin import cross
 from gapcert_engines import Drive
 
 
@@ -55,13 +56,5 @@ def floating(model: Any) -> tuple[int, int]:
 def turned(rotation: Array, v: Array, *, back: bool = False) -> Array:
     """Vectors v (n, 3) turned by unit quaternions (n, 4): from the body's frame into the world's, or `back`."""
     w, r = rotation[:, :1], -rotation[:, 1:] if back else rotation[:, 1:]
-    cross = _cross(r, v)
-    return np.asarray(v + 2 * (w * cross + _cross(r, cross)))
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """a × b of rows (n, 3); numpy's own takes five times as long for few rows."""
-    (ax, ay, az), (bx, by, bz) = a.T, b.T
-    out = np.empty(a.shape)
-    out[:, 0], out[:, 1], out[:, 2] = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-    return out
+    across = cross(r, v)
+    return np.asarray(v + 2 * (w * across + cross(r, across)))

@@ -211,6 +211,22 @@ class Client:
         states = pybullet.getJointStates(self.body, self.index, self.id) if self.index else ()
         return np.array([s[:2] for s in states]).reshape(-1, 2)
 
+    def poses(self, position: Array, base: Array | None) -> tuple[list[str], Array]:
+        """Names of the links, and their frames (n, links, 7) at rest in positions (n, nj) and places of the base (n, 13)."""
+        number = pybullet.getNumJoints(self.body, self.id)
+        names = [pybullet.getBodyInfo(self.body, self.id)[0].decode()]
+        names += [pybullet.getJointInfo(self.body, k, self.id)[12].decode() for k in range(number)]
+        poses = np.empty((len(position), len(names), 7))
+        for k, row in enumerate(position):
+            if base is not None:
+                self.set_base([*base[k, :7].tolist(), *[0.0] * 6])
+            self.set_joints(np.column_stack([row, np.zeros_like(row)]))
+            poses[k, 0] = self.base()[:7]
+            for j, link in enumerate(pybullet.getLinkStates(self.body, range(number), 0, 1, self.id) if number else ()):
+                x, y, z, w = link[5]
+                poses[k, 1 + j] = [*link[4], w, x, y, z]
+        return names, poses
+
     def servo(self, drive: Drive, wheels: list[int], targets: Array, effort: Array) -> None:
         """Efforts for one sub-step: those given, and on the wheels what their servos add (or a rate motor in their place)."""
         body, number, index = self.body, self.id, [self.index[k] for k in wheels]

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, final
+from typing import Any, Literal, final
 
 from pydantic import Field, FiniteFloat
 
-from gapcert_engines import EngineConfig
+from gapcert_engines import Coefficient, EngineConfig
 
-Coefficient = Annotated[FiniteFloat, Field(ge=0)]
 BY_DEFAULT = 0.04  # 1/s: Bullet's drag where nothing is said
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,10 +11,9 @@ from typing import Any, final
 
 from gapcert import Array, Parameter, UsageError
 from gapcert.plugin import Scene
-from gapcert_engines import Drive, Engine, as_backend
+from gapcert_engines import Drive, Engine, as_backend, file_shapes
 
 from .config import PyBulletConfig
-from .drawn import scene
 from .patch import files
 from .section import section
 from .urdf import RobotFile
@@ -80,9 +80,12 @@ class PyBulletEngine(Engine):
     def scene(self, position: Array, base: Array | None) -> Scene:
         client = Client(self.robot, self.config, 1)
         try:
-            return scene(client, self.robot, self.config.ground is not None, position, base)
+            names, poses = client.poses(position, base)
         finally:
             client.close()
+        shapes = file_shapes(ET.fromstring(self.robot.content), self.robot.path.parent, names)
+        found = Scene(tuple(names), shapes, poses)
+        return found if self.config.ground is None else found.with_ground()
 
     def tiles(self) -> tuple[int, str]:
         count = len(self.joints)

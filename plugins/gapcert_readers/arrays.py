@@ -51,14 +51,10 @@ class MatReader(FileReader):
     form = "a MATLAB file, version 5 to 7.3"
     suffixes: ClassVar = (".mat",)
 
-    def from_file(self, path: Path, title: str) -> Sequence[tuple[str, Columns]]:
-        """One trajectory."""
-        return [(title, _matlab(path, title))]
-
     @classmethod
-    def tables(cls, path: Path) -> Sequence[tuple[str, Columns]]:
+    def tables(cls, path: Path, title: str | None = None) -> Sequence[tuple[str, Columns]]:
         """All variables with numbers."""
-        return [(path.name, _matlab(path, path.name))]
+        return [(title or path.name, _matlab(path, title or path.name))]
 
 
 def _open(path: Path, title: str) -> Any:

@@ -57,9 +57,14 @@ class FileReader(gc.plugin.Reader):
             raise gc.UsageError(what, ("recording", "columns", channel))
         return np.arange(len(table[first])) * self.config.period
 
-    @abstractmethod
     def from_file(self, path: Path, title: str) -> Sequence[tuple[str, Columns]]:
-        """(name, columns) of each trajectory, or of several at once, in a file."""
+        """(name, columns) of each trajectory, or of several at once, in a file; by default all its tables."""
+        return self.tables(path, title)
+
+    @classmethod
+    @abstractmethod
+    def tables(cls, path: Path, title: str | None = None) -> Sequence[tuple[str, Columns]]:
+        """(name, columns) of what is in a file, which errors and a lone table call by the title, or by its name."""
 
     def _paths(self, name: str) -> list[Path]:
         path = self.folder / name

@@ -37,11 +37,11 @@ class LerobotReader(FileReader):
         return [(title, {name: np.asarray(values)[rows] for name, values in table.items()})]
 
     @classmethod
-    def tables(cls, path: Path) -> Sequence[tuple[str, Columns]]:
+    def tables(cls, path: Path, title: str | None = None) -> Sequence[tuple[str, Columns]]:
         """Every episode as a table."""
         if not (path / "meta" / "info.json").is_file():
             return ()
-        table = _table(path, path.name)
+        table = _table(path, title or path.name)
         label = np.asarray(table["episode_index"])
         return [(f"episode {e}", {n: np.asarray(v)[label == e] for n, v in table.items()}) for e in np.unique(label).tolist()]
 

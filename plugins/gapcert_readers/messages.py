@@ -54,10 +54,10 @@ class MessageReader(FileReader):
         raise gc.UsageError(f"recording: {title}: no topic for '{column}'; expected /topic.field; there are {known}")
 
     @classmethod
-    def tables(cls, path: Path) -> Sequence[tuple[str, Columns]]:
+    def tables(cls, path: Path, title: str | None = None) -> Sequence[tuple[str, Columns]]:
         """One table per topic that has numbers."""
         series: dict[str, _Series] = {}
-        with told(path.name, cls.form):
+        with told(title or path.name, cls.form):
             for topic, at, content in cls.messages(path, None):
                 series.setdefault(topic, _Series()).add(_stamp(content, at), content)
         out = []
@@ -229,9 +229,9 @@ class Rosbag2Reader(MessageReader):
                 yield connection.topic, at, bag.deserialize(data, connection.msgtype)
 
     @classmethod
-    def tables(cls, path: Path) -> Sequence[tuple[str, Columns]]:
+    def tables(cls, path: Path, title: str | None = None) -> Sequence[tuple[str, Columns]]:
         """One table per topic; none where the folder is no bag."""
-        return super().tables(path) if (path / "metadata.yaml").is_file() else ()
+        return super().tables(path, title) if (path / "metadata.yaml").is_file() else ()
 
 
 def _bag(path: Path) -> Any:

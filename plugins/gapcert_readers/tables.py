@@ -18,19 +18,11 @@ from .separated import line_of, separated
 class TableReader(FileReader):
     """A Recording from files that hold one table each."""
 
-    def from_file(self, path: Path, title: str) -> Sequence[tuple[str, Columns]]:
-        """The one table of a file."""
-        return [(title, self.columns(path, title))]
-
     @classmethod
-    def tables(cls, path: Path) -> Sequence[tuple[str, Columns]]:
+    def tables(cls, path: Path, title: str | None = None) -> Sequence[tuple[str, Columns]]:
         """The one table of a file."""
-        return [(path.name, cls.columns(path, path.name))]
-
-    @classmethod
-    def columns(cls, path: Path, title: str) -> Columns:
-        with told(title, cls.form):
-            return flat(cls.arrow(path))
+        with told(title or path.name, cls.form):
+            return [(title or path.name, flat(cls.arrow(path)))]
 
     @classmethod
     @abstractmethod

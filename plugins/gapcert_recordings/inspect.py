@@ -11,20 +11,8 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.plugin import (
-    SHORTEST,
-    Array,
-    MissingDependency,
-    Reader,
-    StateSpec,
-    Trajectory,
-    UsageError,
-    as_numbers,
-    first_text,
-    harmless,
-    seconds,
-    stated_units,
-)
+from gapcert import Array, MissingDependency, StateSpec, Trajectory, UsageError
+from gapcert.plugin import SHORTEST, Reader, as_numbers, first_text, harmless, seconds, stated_units
 
 from .resampling import Log, pieces, readings
 
@@ -171,13 +159,7 @@ def _trajectory(tr: Trajectory, units: Mapping[str, str]) -> Table:
 def _described(name: str, time: str | None, t: Array, columns: Mapping[str, Array], units: Mapping[str, str]) -> Table:
     logs: list[Log] = []
     with np.errstate(all="ignore"):  # numbers at the end of their range are shown as they are
-        return _told(name, time, t, columns, units, logs)
-
-
-def _told(
-    name: str, time: str | None, t: Array, columns: Mapping[str, Array], units: Mapping[str, str], logs: list[Log]
-) -> Table:
-    described = tuple(_column(n, t, v, units.get(n, ""), logs) for n, v in columns.items())
+        described = tuple(_column(n, t, v, units.get(n, ""), logs) for n, v in columns.items())
     return Table(name, time, t, described, max(logs, key=lambda log: log.dropped, default=Log()))
 
 

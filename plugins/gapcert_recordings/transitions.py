@@ -5,15 +5,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
 import numpy.typing as npt
 
 from gapcert.plugin import Array, Model, Recording, Trajectory, UsageError
-
-if TYPE_CHECKING:
-    pass
 
 TIMING = 1e-3  # of the period: how far two rows may be from one period apart
 

@@ -22,6 +22,13 @@ _COMMON: Table = {
 }
 
 
+def _functions(of: Any) -> Table:
+    """What NumPy, and who goes by it, calls our functions."""
+    names = {"atan": "arctan", "asin": "arcsin", "acos": "arccos", "min": "minimum", "max": "maximum"}
+    names |= {n: n for n in ("sin", "cos", "tan", "exp", "log", "sqrt", "tanh", "sign")}
+    return {ours: getattr(of, theirs) for ours, theirs in names.items()}
+
+
 def power(x: Any, n: int) -> Any:
     """x^n for n >= 1 by squaring and multiplying, in the order in which Intervals do it."""
     out = None
@@ -36,12 +43,11 @@ def power(x: Any, n: int) -> Any:
 
 def array_table(xp: Any) -> Table:
     """Operations on arrays of NumPy, or of a namespace like it."""
-    names = {"atan": "arctan", "asin": "arcsin", "acos": "arccos", "min": "minimum", "max": "maximum", "round": "rint"}
-    plain = {n: getattr(xp, n) for n in ("sin", "cos", "tan", "exp", "log", "sqrt", "tanh", "sign", "power")}
     return {
         **_COMMON,
-        **plain,
-        **{ours: getattr(xp, theirs) for ours, theirs in names.items()},
+        **_functions(xp),
+        "round": xp.rint,
+        "power": xp.power,
         "number": lambda p, q: np.float64(p) / q,
         "pow": power,
         "pick": lambda a, b, p, q: xp.where(a <= b, p, q),
@@ -131,20 +137,8 @@ def _interval_power(b: Interval, e: Any) -> Interval:
 
 INTERVAL: Table = {
     **_COMMON,
-    "sin": Interval.sin,
-    "cos": Interval.cos,
-    "tan": Interval.tan,
-    "exp": Interval.exp,
-    "log": Interval.log,
-    "sqrt": Interval.sqrt,
-    "tanh": Interval.tanh,
-    "sign": Interval.sign,
+    **_functions(Interval),
     "round": lambda v: Interval(np.rint(v.lo), np.rint(v.hi)),
-    "atan": Interval.arctan,
-    "asin": Interval.arcsin,
-    "acos": Interval.arccos,
-    "min": Interval.minimum,
-    "max": Interval.maximum,
     "number": lambda p, q: Interval.exact(p) / q if q != 1 else Interval.exact(p),
     "pow": operator.pow,
     "power": _interval_power,

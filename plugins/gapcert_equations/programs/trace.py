@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, final
@@ -54,6 +54,11 @@ class Program:
         return frozenset(int(op) for part in self.code for op in part[:, 0])
 
 
+def _operators(name: str) -> tuple[Callable[[Symbol, Any], Symbol], Callable[[Symbol, Any], Symbol]]:
+    """What Python asks of the left and of the right operand: both are recorded as the same operation."""
+    return lambda self, other: self.graph.put(name, self, other), lambda self, other: self.graph.put(name, other, self)
+
+
 @final
 class Symbol:
     """A value of the program that is being recorded."""
@@ -64,29 +69,10 @@ class Symbol:
     def __init__(self, graph: Graph, index: int) -> None:
         self.graph, self.index = graph, index
 
-    def __add__(self, other: Any) -> Symbol:
-        return self.graph.put("add", self, other)
-
-    def __radd__(self, other: Any) -> Symbol:
-        return self.graph.put("add", other, self)
-
-    def __sub__(self, other: Any) -> Symbol:
-        return self.graph.put("sub", self, other)
-
-    def __rsub__(self, other: Any) -> Symbol:
-        return self.graph.put("sub", other, self)
-
-    def __mul__(self, other: Any) -> Symbol:
-        return self.graph.put("mul", self, other)
-
-    def __rmul__(self, other: Any) -> Symbol:
-        return self.graph.put("mul", other, self)
-
-    def __truediv__(self, other: Any) -> Symbol:
-        return self.graph.put("div", self, other)
-
-    def __rtruediv__(self, other: Any) -> Symbol:
-        return self.graph.put("div", other, self)
+    __add__, __radd__ = _operators("add")
+    __sub__, __rsub__ = _operators("sub")
+    __mul__, __rmul__ = _operators("mul")
+    __truediv__, __rtruediv__ = _operators("div")
 
     def __neg__(self) -> Symbol:
         return self.graph.put("neg", self)

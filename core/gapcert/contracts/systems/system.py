@@ -97,6 +97,8 @@ def difference(specs: Sequence[StateSpec], a: Array, b: Array) -> Array:
 
 
 Capability = Literal["hidden", "parameters", "forces", "seed"]
+Values = Mapping[str, Array | float]
+"""Of parameters by name: one each, or one per row (n,)."""
 
 
 class System(ABC):
@@ -156,7 +158,7 @@ class System(ABC):
         u: Array,
         *,
         hidden: Array | None = None,
-        parameters: Mapping[str, Array | float] | None = None,
+        parameters: Values | None = None,
         forces: Array | None = None,
         seed: int | None = None,
     ) -> Step:
@@ -187,7 +189,7 @@ class System(ABC):
         u_sequence: Array,
         *,
         hidden: Array | None = None,
-        parameters: Mapping[str, Array | float] | None = None,
+        parameters: Values | None = None,
         forces: Array | None = None,
         seed: int | None = None,
     ) -> Step:
@@ -391,18 +393,12 @@ class Model(System, Extendable, EngineHints):
         """Contains {∂²f/∂z_axis² : z ∈ box}, shape (n, nx), rounded outwards; [−∞, ∞] where a slope may jump, or by default."""
         return Interval(np.full((len(z), self.nx), -np.inf), np.full((len(z), self.nx), np.inf))
 
-    def output(self, x: Array, u: Array, parameters: Mapping[str, Array | float] | None = None) -> Array:
+    def output(self, x: Array, u: Array, parameters: Values | None = None) -> Array:
         """y = h(x, u), shape (n, ny); by default the state itself."""
         return x
 
     def fast_rollout(
-        self,
-        x0: Array,
-        u: Array,
-        *,
-        parameters: Mapping[str, Array | float] | None = None,
-        hidden: Array | None = None,
-        every: int = 1,
+        self, x0: Array, u: Array, *, parameters: Values | None = None, hidden: Array | None = None, every: int = 1
     ) -> Step:
         """`rollout` within rounding: x (n, T // every + 1, nx) from x0 (n, nx), row i under u[i mod w] of u (w, T, nu).
 
@@ -430,14 +426,7 @@ class Model(System, Extendable, EngineHints):
                 hidden[rows] = new.hidden
         return Step(out, hidden)
 
-    def along(
-        self,
-        x: Array,
-        u: Array,
-        *,
-        parameters: Mapping[str, Array | float] | None = None,
-        hidden: Array | None = None,
-    ) -> Array:
+    def along(self, x: Array, u: Array, *, parameters: Values | None = None, hidden: Array | None = None) -> Array:
         """One step from every state of given motions x (n, T, nx) under u (n, T, nu): x⁺ (n, T, nx), hidden state handed on.
 
         Unlike a rollout, every step starts from the motion that is given. parameters: one per motion.
@@ -452,9 +441,7 @@ class Model(System, Extendable, EngineHints):
             out[:, k], hidden = result.x, result.hidden
         return out
 
-    def fast_memories(
-        self, path: Array, u: Array, stops: Sequence[int], parameters: Mapping[str, Array | float], hidden: Array
-    ) -> Array | None:
+    def fast_memories(self, path: Array, u: Array, stops: Sequence[int], parameters: Values, hidden: Array) -> Array | None:
         """Hidden states (n, stops, nh) before steps `stops` of motions under u (w, T, nu), from hidden (n, nh), w dividing n.
 
         They go on from path (w, T, nx) where that is finite, else from where they are. None: there is nothing faster than
@@ -462,7 +449,7 @@ class Model(System, Extendable, EngineHints):
         """
         return None
 
-    def output_delays(self, parameters: Mapping[str, Array | float] | None = None) -> Array:
+    def output_delays(self, parameters: Values | None = None) -> Array:
         """Seconds by which each output shows the past, (ny,), or (n, ny) for parameters (n,); `output` does not apply them."""
         rows = np.broadcast_shapes(*(np.shape(v) for v in (parameters or {}).values()))
         return np.zeros((*rows, len(self.outputs)))
