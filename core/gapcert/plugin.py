@@ -8,7 +8,6 @@ from gapcert.lazy import LazyPackage, homes
 
 _HOME = homes(
     {
-        "gapcert.certification.bounds.multilinear": "MultilinearPredictor",
         "gapcert.certification.bounds.slope_growth": "Trails follow",
         "gapcert.certification.bounds.supremum": "supremum",
         "gapcert.certification.certificate": (
@@ -59,7 +58,7 @@ _HOME = homes(
         "gapcert.numerics.digest": "json_digest",
         "gapcert.numerics.errors": "GapcertError MissingDependency NoStart SpecError Undecided UsageError clipped harmless",
         "gapcert.numerics.identities": "identity located",
-        "gapcert.numerics.interpolation": "cells cut highest interpolate joined on_curvature ranges rounding worst",
+        "gapcert.numerics.interpolation": "cells cut highest interpolate joined on_curvature ranges rounding slopes worst",
         "gapcert.numerics.intervals": "Interval",
         "gapcert.numerics.kernels": "compiler",
         "gapcert.numerics.majorant": "cells_of majorant majorant_of",

@@ -1,4 +1,3 @@
-from gapcert.certification.bounds.multilinear import MultilinearPredictor as MultilinearPredictor
 from gapcert.certification.bounds.slope_growth import Trails as Trails
 from gapcert.certification.bounds.slope_growth import follow as follow
 from gapcert.certification.bounds.supremum import supremum as supremum
@@ -165,6 +164,7 @@ from gapcert.numerics.interpolation import joined as joined
 from gapcert.numerics.interpolation import on_curvature as on_curvature
 from gapcert.numerics.interpolation import ranges as ranges
 from gapcert.numerics.interpolation import rounding as rounding
+from gapcert.numerics.interpolation import slopes as slopes
 from gapcert.numerics.interpolation import worst as worst
 from gapcert.numerics.intervals import Interval as Interval
 from gapcert.numerics.kernels import compiler as compiler
