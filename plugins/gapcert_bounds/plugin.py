@@ -1,104 +1,57 @@
 """Declares what this package offers; imports nothing but gapcert."""
 
-import gapcert
+from typing import Any
 
-CONFIG = "gapcert_bounds.config"
-
-
-@gapcert.hookimpl
-def gapcert_components() -> list[gapcert.Component]:
-    return [*_estimators(), *_families(), *_contracts()]
+from gapcert.plugin import Component, hookimpl
 
 
-def _estimators() -> list[gapcert.Component]:
+@hookimpl
+def gapcert_components() -> list[Component]:
+    home = "gapcert_bounds.testing.contracts"
     return [
-        gapcert.Component(
-            "lipschitz",
-            "declared",
-            "constants that the user states",
-            "gapcert_bounds.constants.lipschitz:Declared",
-            f"{CONFIG}:DeclaredConfig",
-        ),
-        gapcert.Component(
-            "lipschitz",
-            "interval",
-            "constants proved from the equations of both systems",
-            "gapcert_bounds.constants.lipschitz:IntervalJacobian",
-            f"{CONFIG}:IntervalJacobianConfig",
-        ),
-        gapcert.Component(
-            "lipschitz",
-            "wood-zhang",
-            "constants estimated from sampled slopes by extreme value theory",
-            "gapcert_bounds.constants.wood_zhang:WoodZhang",
-            f"{CONFIG}:WoodZhangConfig",
-            claim="statistical",
-        ),
-        gapcert.Component(
-            "lipschitz",
-            "gradient-elite",
-            "constants estimated from slopes searched for around the steepest",
-            "gapcert_bounds.constants.gradient_elite:GradientElite",
-            f"{CONFIG}:GradientEliteConfig",
-            claim="statistical",
-        ),
-        gapcert.Component(
-            "lipschitz",
-            "piecewise",
-            "constants per cell and jumps where slopes grow, estimated from close pairs",
-            "gapcert_bounds.constants.piecewise:Piecewise",
-            f"{CONFIG}:PiecewiseConfig",
-            claim="statistical",
-        ),
-    ]
-
-
-def _families() -> list[gapcert.Component]:
-    return [
-        gapcert.Component(
+        *(_bound("lipschitz", "constants", *row, claim="deterministic") for row in _PROVED),
+        *(_bound("lipschitz", "constants", *row, claim="statistical") for row in _ESTIMATED),
+        *(_bound("gap_family", "families", *row) for row in _FAMILIES),
+        _bound(
             "gap_family",
-            "constant",
-            "the smallest certified constant",
-            "gapcert_bounds.families.constant:Constant",
-            f"{CONFIG}:ConstantConfig",
-        ),
-        gapcert.Component(
-            "gap_family",
+            "families",
             "declared",
             "a constant that the user states",
-            "gapcert_bounds.families.constant:Declared",
-            f"{CONFIG}:DeclaredGapConfig",
+            "constant:Declared",
+            "DeclaredGap",
             claim="assumed",
         ),
-        gapcert.Component(
+        _bound(
             "gap_family",
-            "envelope",
-            "the tightest band that samples and constants allow",
-            "gapcert_bounds.families.envelope:Envelope",
-            f"{CONFIG}:EnvelopeConfig",
-        ),
-        gapcert.Component(
-            "gap_family",
-            "multilinear",
-            "interpolation on a lattice, and what curvature allows it to miss",
-            "gapcert_bounds.families.multilinear:Multilinear",
-            f"{CONFIG}:MultilinearConfig",
-        ),
-        gapcert.Component(
-            "gap_family",
+            "families",
             "basis",
             "a sum of named basis functions by the scenario program",
-            "gapcert_bounds.families.basis:Basis",
-            f"{CONFIG}:BasisConfig",
+            "basis:Basis",
             requires=("cvxpy", "clarabel"),
             extra="basis",
         ),
+        Component("contract", "GapFamilyContract", "what every gap family keeps", f"{home}:GapFamilyContract"),
+        Component("contract", "LipschitzContract", "what every estimator keeps", f"{home}:LipschitzContract"),
     ]
 
 
-def _contracts() -> list[gapcert.Component]:
-    home = "gapcert_bounds.testing.contracts"
-    return [
-        gapcert.Component("contract", "GapFamilyContract", "what every gap family keeps", f"{home}:GapFamilyContract"),
-        gapcert.Component("contract", "LipschitzContract", "what every estimator keeps", f"{home}:LipschitzContract"),
-    ]
+def _bound(kind: str, folder: str, name: str, summary: str, target: str, options: str = "", **more: Any) -> Component:
+    """Its options are called like its class, unless something else is said."""
+    config = f"gapcert_bounds.config:{options or target.partition(':')[2]}Config"
+    return Component(kind, name, summary, f"gapcert_bounds.{folder}.{target}", config, **more)
+
+
+_PROVED = (
+    ("declared", "constants that the user states", "lipschitz:Declared"),
+    ("interval", "constants proved from the equations of both systems", "lipschitz:IntervalJacobian"),
+)
+_ESTIMATED = (
+    ("wood-zhang", "constants estimated from sampled slopes by extreme value theory", "wood_zhang:WoodZhang"),
+    ("gradient-elite", "constants estimated from slopes searched for around the steepest", "gradient_elite:GradientElite"),
+    ("piecewise", "constants per cell and jumps where slopes grow, estimated from close pairs", "piecewise:Piecewise"),
+)
+_FAMILIES = (
+    ("constant", "the smallest certified constant", "constant:Constant"),
+    ("envelope", "the tightest band that samples and constants allow", "envelope:Envelope"),
+    ("multilinear", "interpolation on a lattice, and what curvature allows it to miss", "multilinear:Multilinear"),
+)
