@@ -63,7 +63,7 @@ _HOME = homes(
         "gapcert.numerics.kernels": "compiler",
         "gapcert.numerics.majorant": "cells_of majorant majorant_of",
         "gapcert.numerics.order_statistics": "missed",
-        "gapcert.numerics.texts": "columns times",
+        "gapcert.numerics.texts": "columns leaves times",
         "gapcert.run.build": "Build",
         "gapcert.run.study": "Outcome Study",
         "gapcert.run.verdict": "outside share",

@@ -168,6 +168,7 @@ from gapcert.numerics.majorant import majorant as majorant
 from gapcert.numerics.majorant import majorant_of as majorant_of
 from gapcert.numerics.order_statistics import missed as missed
 from gapcert.numerics.texts import columns as columns
+from gapcert.numerics.texts import leaves as leaves
 from gapcert.numerics.texts import times as times
 from gapcert.run.build import Build as Build
 from gapcert.run.study import Outcome as Outcome
