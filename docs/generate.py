@@ -180,15 +180,19 @@ class Classes(Generated):
 
 
 class Offered(Generated):
-    """What a package offers besides what the page tells of, each with its first sentence."""
+    """What a package offers besides what the page tells of, each with its first sentence, by the folders that it is from."""
 
     def markdown(self) -> str:
         package = importlib.import_module(self.arguments[0])
         page = Path(self.env.doc2path(self.env.docname)).read_text()
-        rest = [
-            n for n in sorted(package._HOME, key=str.lower) if not re.search(rf"^\.\. \w+:: (\w+\.)*{n}$", page, re.MULTILINE)
-        ]
-        return table(["name", "what it is"], [[f"`{n}`", first_sentence(getattr(package, n))] for n in rest])
+        groups: dict[str, list[list[str]]] = {}
+        for name in sorted(package._HOME, key=str.lower):
+            if not re.search(rf"^\.\. \w+:: (\w+\.)*{name}$", page, re.MULTILINE):
+                home = importlib.import_module(package._HOME[name])
+                rows = groups.setdefault(home.__name__ if hasattr(home, "__path__") else home.__package__ or "", [])
+                rows.append([f"`{name}`", first_sentence(getattr(package, name))])
+        told = [(first_sentence(importlib.import_module(g)), table(["name", "what it is"], groups[g])) for g in sorted(groups)]
+        return "\n\n".join(f"{said}\n\n{rows}" for said, rows in told)
 
 
 def first_sentence(value: Any) -> str:

@@ -50,10 +50,11 @@ _MOVED = homes(
     {
         "gapcert.plugin": (
             "AffinePredictor Automaton Bools Cells Cover Effect EffectParameter Extension GapFamily GapProblem "
-            "Ints LipschitzBound LipschitzEstimator LipschitzProblem Memory ModelPredictor MultilinearPredictor Points "
+            "Ints LipschitzBound LipschitzEstimator LipschitzProblem Memory ModelPredictor Points "
             "Policy Predictor Pulse Reader Relation Residual Samples Scene Shape Step Synthesizer Trails cells_of compiler "
             "difference follow identity located magnitude majorant majorant_of supremum"
         ),
+        "gapcert_bounds": "MultilinearPredictor",
         "gapcert_cells": (
             "Along AutomatonController GridController Splits Successors SuccessorsByLevel automaton_of loading read_hoa "
             "write_saved"

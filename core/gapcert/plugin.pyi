@@ -1,4 +1,3 @@
-from gapcert.certification.bounds.multilinear import MultilinearPredictor as MultilinearPredictor
 from gapcert.certification.bounds.slope_growth import Trails as Trails
 from gapcert.certification.bounds.slope_growth import follow as follow
 from gapcert.certification.bounds.supremum import supremum as supremum
@@ -40,7 +39,6 @@ from gapcert.contracts.controllers.policies import Policy as Policy
 from gapcert.contracts.controllers.policies import known as known
 from gapcert.contracts.data.effect import Effect as Effect
 from gapcert.contracts.data.effect import EffectParameter as EffectParameter
-from gapcert.contracts.data.effect import SiteKind as SiteKind
 from gapcert.contracts.data.effect import position as position
 from gapcert.contracts.data.effect import site_units as site_units
 from gapcert.contracts.data.recording import SHORTEST as SHORTEST
@@ -51,10 +49,8 @@ from gapcert.contracts.data.recording import Trajectory as Trajectory
 from gapcert.contracts.data.recording import as_numbers as as_numbers
 from gapcert.contracts.data.recording import first_text as first_text
 from gapcert.contracts.data.recording import seconds as seconds
-from gapcert.contracts.data.units import grouped as grouped
 from gapcert.contracts.data.units import magnitude as magnitude
 from gapcert.contracts.data.units import pretty as pretty
-from gapcert.contracts.data.units import product as product
 from gapcert.contracts.data.units import shown as shown
 from gapcert.contracts.data.units import stated_units as stated_units
 from gapcert.contracts.data.units import without_units as without_units
@@ -77,8 +73,6 @@ from gapcert.contracts.plugins.command import ALLOW_CODE as ALLOW_CODE
 from gapcert.contracts.plugins.command import EXECUTED as EXECUTED
 from gapcert.contracts.plugins.command import LOG as LOG
 from gapcert.contracts.plugins.command import RUN as RUN
-from gapcert.contracts.plugins.command import SET as SET
-from gapcert.contracts.plugins.command import SPEC as SPEC
 from gapcert.contracts.plugins.command import Answer as Answer
 from gapcert.contracts.plugins.command import Argument as Argument
 from gapcert.contracts.plugins.command import Arguments as Arguments
@@ -168,6 +162,7 @@ from gapcert.numerics.interpolation import joined as joined
 from gapcert.numerics.interpolation import on_curvature as on_curvature
 from gapcert.numerics.interpolation import ranges as ranges
 from gapcert.numerics.interpolation import rounding as rounding
+from gapcert.numerics.interpolation import slopes as slopes
 from gapcert.numerics.interpolation import worst as worst
 from gapcert.numerics.intervals import Interval as Interval
 from gapcert.numerics.kernels import compiler as compiler
@@ -176,6 +171,7 @@ from gapcert.numerics.majorant import majorant as majorant
 from gapcert.numerics.majorant import majorant_of as majorant_of
 from gapcert.numerics.order_statistics import missed as missed
 from gapcert.numerics.texts import columns as columns
+from gapcert.numerics.texts import leaves as leaves
 from gapcert.numerics.texts import times as times
 from gapcert.run.build import Build as Build
 from gapcert.run.study import Outcome as Outcome

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pydantic import BaseModel
 
-from gapcert.plugin import of_config
+from gapcert.plugin import leaves, of_config
 
 Options = dict[str, Any]
 
@@ -26,15 +26,7 @@ def plain(value: Any) -> Any:
 
 def flat(config: Any) -> Options:
     """Every option of a config by its dotted path; `kind` names the component and is none."""
-
-    def walk(value: Any, path: str) -> Iterator[tuple[str, Any]]:
-        if isinstance(value, Mapping) and value:
-            for key, item in value.items():
-                yield from walk(item, f"{path}.{key}" if path else str(key))
-        else:
-            yield path, value
-
-    return {k: v for k, v in walk(config.model_dump(), "") if k != "kind"} if isinstance(config, BaseModel) else {}
+    return {k: v for k, v in leaves(config.model_dump()) if k != "kind"} if isinstance(config, BaseModel) else {}
 
 
 def changed(config: Any, options: Mapping[str, Any]) -> Any:

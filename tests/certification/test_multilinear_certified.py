@@ -13,6 +13,7 @@ from forging import edit_arrays, edit_json
 import gapcert as gc
 from gapcert.certification.samples import designs
 from gapcert.testing.toys import Drift, Perturbed, ripple
+from gapcert_bounds import MultilinearPredictor
 from gapcert_verify.verify import verify_run
 
 VALUES, CURVATURE = {"x0": {"x0": 0.03, "u0": 0.08}}, {"x0": {"x0": 0.09, "u0": 0.04}}
@@ -184,7 +185,7 @@ def test_what_does_not_fit_together_is_one_sentence(tmp_path):
 
     ask("needs nodes of a lattice", sampling=gc.AdaptiveSampling(50))
     ask("bounds of curvature, and declared gives none", lipschitz=plain)
-    ask("has kinks at its nodes", lipschitz=bounds(), predictor=gc.plugin.MultilinearPredictor(*flat()))
+    ask("has kinks at its nodes", lipschitz=bounds(), predictor=MultilinearPredictor(*flat()))
     cut = gc.Domain.of(model, {"x0": (-1.0, 1.0), "u0": (-2.0, 2.0)}, ["x0 + u0 <= 1"])
     ask("a lattice needs a box", where=cut, lipschitz=bounds())
     with pytest.raises(gc.UsageError, match="either counts or a budget"):

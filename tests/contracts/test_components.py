@@ -1,6 +1,7 @@
 """Discovery that neither hangs nor dies, and errors that say what to do."""
 
 import importlib.metadata
+import pickle
 import re
 import sys
 import types
@@ -13,6 +14,7 @@ from gapcert import Component, Context, Event, MissingDependency, UsageError, ho
 from gapcert.contracts.plugins.component import KINDS, load
 from gapcert.contracts.plugins.events import broadcast, silent
 from gapcert.contracts.plugins.registry import discover, registry
+from gapcert.numerics.digest import digest
 
 
 @dataclass
@@ -280,3 +282,13 @@ def test_every_config_model_is_strict_and_discriminated():
 def test_nothing_installed_here_is_broken():
     assert registry().broken == ()
     assert {p.name for p in importlib.metadata.entry_points(group="gapcert")} >= {"bounds", "equations", "pybullet"}
+
+
+def test_who_loads_models_for_a_component_is_no_part_of_what_it_is():
+    """Contexts are kept by systems, which go to other processes and have digests."""
+    alone, within = Context(seed=3), Context(seed=3, loader=lambda path: path)
+    assert within.other("a.yaml") == "a.yaml"
+    assert pickle.loads(pickle.dumps(within)) == alone
+    assert digest(within) == digest(alone)
+    with pytest.raises(UsageError, match=r"a\.yaml: the model of another spec is taken only from within a spec"):
+        alone.other("a.yaml")

@@ -9,6 +9,7 @@ import pytest
 
 import gapcert as gc
 from gapcert.certification.bounds.curvature import second
+from gapcert_bounds import MultilinearPredictor
 from gapcert_bounds.constants.interval_curvature import merged
 from gapcert_bounds.constants.lipschitz import IntervalJacobian
 from gapcert_bounds.families.multilinear import Multilinear
@@ -127,7 +128,7 @@ def test_a_model_without_second_derivatives_has_no_curvature():
 def test_a_multilinear_predictor_bends_at_its_nodes_only():
     rng = np.random.default_rng(4)
     axes = (np.array([-1.5, 0.1, 1.5]), np.array([0.0]), np.array([-1.0, 1.0]))
-    residual, problem = question(predictor=gc.plugin.MultilinearPredictor(axes, rng.normal(size=(3, 1, 2, 2))))
+    residual, problem = question(predictor=MultilinearPredictor(axes, rng.normal(size=(3, 1, 2, 2))))
     bound = curved(problem, slabs=16)
     cuts, parts = bound.slabs[0]
     whole = (cuts[:-1] <= 0.1) & (cuts[1:] >= 0.1)

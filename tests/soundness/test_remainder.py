@@ -17,6 +17,7 @@ import gapcert as gc
 import gapcert_networks
 from gapcert.certification.coordinates import Coordinates, RelativeGap, RelativePredictor
 from gapcert.contracts.gaps.predictor import Predictor
+from gapcert_bounds import MultilinearPredictor
 from gapcert_bounds.families.envelope import EnvelopeGap, PiecewiseEnvelope
 from gapcert_bounds.families.multilinear import MultilinearGap
 from gapcert_bounds.testing.fields import Nothing, Waves, gap_problem, lattice
@@ -29,7 +30,7 @@ Array = np.ndarray
 
 FIELD = Waves.smooth()
 STEEP = gc.plugin.AffinePredictor(np.array([0.3, -2.0]), np.array([[3.0, -2.0, 1.5], [0.5, 4.0, -2.5]]))
-WOVEN = gc.plugin.MultilinearPredictor((np.array([-1.0, 0.1, 1.0]),) * 3, np.random.default_rng(0).normal(size=(3, 3, 3, 2)))
+WOVEN = MultilinearPredictor((np.array([-1.0, 0.1, 1.0]),) * 3, np.random.default_rng(0).normal(size=(3, 3, 3, 2)))
 RELATIVE = Coordinates(FIELD.inputs, ("u0 - 0.7 x1 + 0.2 x0",), ((0.2, -0.7),), (1.3,))
 
 PREDICTORS: dict[str, Predictor] = {

@@ -17,7 +17,6 @@ from typing import Any, final
 import numpy as np
 
 from gapcert.certification import gates
-from gapcert.certification.bounds.multilinear import MultilinearPredictor
 from gapcert.certification.bounds.refutation import watched
 from gapcert.certification.certificate import Audit, Certificate, Ledger, Record, gap_digest
 from gapcert.certification.compatibility import refuse, unpaired
@@ -115,7 +114,7 @@ class Question:
     sampling: Sampling
     lipschitz: LipschitzEstimator
     family: GapFamily
-    predictor: Predictor | Model | str
+    predictor: Any
     route: Route
     fit: Route
     request: Request
@@ -224,7 +223,7 @@ def measure(question: Question, store: Store, gate: Gate) -> GapProblem:
     return replace(problem, emit=store.emit, folder=store.folder.parent / "fit")
 
 
-def _predictor(choice: Predictor | Model | str, samples: Samples, model: Model, domain: Domain) -> Predictor:
+def _predictor(choice: Any, samples: Samples, model: Model, domain: Domain) -> Predictor:
     if isinstance(choice, Predictor):
         return choice
     if isinstance(choice, Model):
@@ -233,12 +232,12 @@ def _predictor(choice: Predictor | Model | str, samples: Samples, model: Model, 
         return ModelPredictor(choice, model)
     if choice == "affine":
         return AffinePredictor.fit(samples)
-    if choice == "multilinear":
-        return MultilinearPredictor.fit(samples, domain)
+    if callable(choice):
+        return choice(samples, domain)
     if choice == "none":
         return AffinePredictor.none(samples.r.shape[1], samples.z.shape[1])
     raise UsageError(
-        f"certify: found predictor {choice!r}; expected 'none', 'affine', 'multilinear', a Predictor or an extended Model"
+        f"certify: found predictor {choice!r}; expected 'none', 'affine', a Predictor, what makes one, or an extended Model"
     )
 
 

@@ -239,14 +239,8 @@ def in_words(model: Model, domain: Domain) -> str:
 
 def _digest(wrapper: System, system: System, coordinates: Coordinates) -> str:
     # The System says itself what determines its answers: caches and tiles do not.
-    parts = [
-        type(wrapper).__qualname__,
-        system.digest(),
-        coordinates.slope,
-        coordinates.scale,
-        [a.name for a in wrapper.inputs],
-    ]
-    return json_digest(*parts)
+    names = [a.name for a in wrapper.inputs]
+    return json_digest(type(wrapper).__qualname__, system.digest(), coordinates.slope, coordinates.scale, names)
 
 
 @final

@@ -1,8 +1,9 @@
-"""Tables and counts in plain text."""
+"""Tables, counts and paths in plain text."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 
 def columns(head: Sequence[str], rows: Sequence[Sequence[object]]) -> Iterator[str]:
@@ -16,3 +17,12 @@ def columns(head: Sequence[str], rows: Sequence[Sequence[object]]) -> Iterator[s
 def times(count: int, thing: str) -> str:
     """A number of things: `1 run`, `20 runs`."""
     return f"{count:,} {thing}" + ("" if count == 1 else "s")
+
+
+def leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """(dotted path, value) of all that nested mappings hold."""
+    if isinstance(value, Mapping) and value:
+        for key, item in value.items():
+            yield from leaves(item, f"{path}.{key}" if path else str(key))
+    else:
+        yield path, value

@@ -12,6 +12,7 @@ from gapcert.plugin import GapFamily, GapProblem, Pulse, supremum
 from gapcert_bounds.constants.lipschitz import named
 
 from .envelope import Envelope
+from .multilinear_predictor import made
 
 
 @final
@@ -48,7 +49,7 @@ class Constant(GapFamily):
     extremes = True
 
     def __init__(self, predictor: Any = "none") -> None:
-        self.predictor = predictor
+        self.predictor = made(predictor)
 
     def fit(self, problem: GapProblem) -> ConstantGap:
         if problem.route == "theorem1":

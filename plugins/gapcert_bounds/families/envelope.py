@@ -15,6 +15,7 @@ from gapcert import Array, Domain, GapFunction, Interval, UsageError
 from gapcert.plugin import Cells, GapFamily, GapProblem, Predictor
 
 from .cone import Cones
+from .multilinear_predictor import made
 
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = float(np.finfo(np.float64).tiny)
@@ -257,7 +258,7 @@ class Envelope(GapFamily):
     routes = ("dominate",)
 
     def __init__(self, predictor: Any = "affine") -> None:
-        self.predictor = predictor
+        self.predictor = made(predictor)
 
     def fit(self, problem: GapProblem) -> GapFunction:
         if len(problem.samples) == 0:

@@ -9,8 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array, GapFunction, Interval, UsageError
-from gapcert.plugin import GapFamily, GapProblem, MultilinearPredictor, Predictor
+from gapcert.plugin import GapFamily, GapProblem, Predictor
 from gapcert_functions import mean_value
+
+from .multilinear_predictor import MultilinearPredictor
 
 Index = npt.NDArray[np.intp]
 

@@ -54,7 +54,7 @@ class Ending:
                 for e in error.errors()  # type: ignore[attr-defined]
             )
             raise UsageError(f"controller.terminal: {told}") from None
-        self.maker: Synthesizer = known.build("synthesizer", kind, config, Context(other=_refused))
+        self.maker: Synthesizer = known.build("synthesizer", kind, config, Context(loader=_refused))
         self.policy: Policy = of_config(config, "headline") or "first"
 
     def check(self, model: Model, domain: Domain, goal: Goal) -> None:

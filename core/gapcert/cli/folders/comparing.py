@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, final
 
 from gapcert.cli.folders.listing import entry
-from gapcert.numerics.texts import columns
+from gapcert.numerics.texts import columns, leaves
 from gapcert.run.manifest import stored
 from gapcert.run.progress_rate import figure
 from gapcert.run.status import RunFolder
@@ -54,17 +54,9 @@ def compare(runs: Sequence[RunFolder]) -> dict[str, Any]:
 
 def differences(specs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Paths at which specs differ, with the value of each; null where one has none."""
-    flat = [dict(_flat(s, "")) for s in specs]
+    flat = [dict(leaves(s)) for s in specs]
     paths = sorted({p for f in flat for p in f})
     return [{"path": p, "values": [f.get(p) for f in flat]} for p in paths if any(f.get(p) != flat[0].get(p) for f in flat)]
-
-
-def _flat(value: Any, path: str) -> Iterator[tuple[str, Any]]:
-    if isinstance(value, Mapping) and value:
-        for key, item in value.items():
-            yield from _flat(item, f"{path}.{key}" if path else str(key))
-    else:
-        yield path, value
 
 
 def change(a: Figure | None, b: Figure | None) -> Change:

@@ -176,7 +176,8 @@ class GapFamily(ABC):
 
     Any subset of the samples is enough on route dominate. `extremes` says that on route theorem1 the extremes of coarse cells
     are enough, too: that γ needs of the samples only max_k |r_ki|. `lattice` says that the samples must be nodes of a lattice.
-    `predictor` is what it asks to be subtracted before: a Predictor, an extended Model, or `none`, `affine` or `multilinear`.
+    `predictor` is what it asks to be subtracted before: `none`, `affine`, a Predictor, what makes one of (Samples, Domain), or
+    an extended Model.
     """
 
     name: str

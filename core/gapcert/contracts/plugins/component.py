@@ -76,16 +76,12 @@ class Component:
         return load(self.target)
 
 
-def _alone(path: str) -> Model:
-    raise UsageError(f"{path}: the model of another spec is taken only from within a spec; give the model itself")
-
-
 @final
 @dataclass(frozen=True)
 class Context:
     """What a component may need besides its own options when it is built from a spec.
 
-    other(path): the model of another spec.
+    loader: of the model of another spec, by its path.
     """
 
     folder: Path = field(default_factory=Path)
@@ -93,7 +89,17 @@ class Context:
     seed: int = 0
     allow_code: bool = False
     period: float | None = None
-    other: Callable[[str], Model] = _alone
+    loader: Callable[[str], Model] | None = field(default=None, repr=False, compare=False)
+
+    def other(self, path: str) -> Model:
+        """The model of another spec; UsageError where no spec stands behind the component."""
+        if self.loader is None:
+            raise UsageError(f"{path}: the model of another spec is taken only from within a spec; give the model itself")
+        return self.loader(path)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is asked once goes to no other process, and has no part in what a component is."""
+        return {k: v for k, v in vars(self).items() if k != "loader"}
 
 
 def load(target: str) -> Any:

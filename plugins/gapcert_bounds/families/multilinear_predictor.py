@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import final
+from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.contracts.gaps.predictor import Predictor, Samples
-from gapcert.contracts.systems.domain import Domain
-from gapcert.numerics.arrays import Array
-from gapcert.numerics.errors import UsageError
-from gapcert.numerics.interpolation import cells, cut, interpolate, ranges, rounding, slopes
-from gapcert.numerics.intervals import Interval
+from gapcert import Array, Domain, Interval, UsageError
+from gapcert.plugin import Predictor, Samples, cells, cut, interpolate, ranges, rounding, slopes
 
 _NODES = 1_000
 _FITTED = 20_000
@@ -95,3 +91,8 @@ class MultilinearPredictor(Predictor):
 
     def arrays(self) -> dict[str, Array]:
         return {**{f"axis{j}": a for j, a in enumerate(self.axes)}, "values": self.values}
+
+
+def made(predictor: Any) -> Any:
+    """What a family asks to be subtracted: for `multilinear`, what makes one of samples."""
+    return MultilinearPredictor.fit if predictor == "multilinear" else predictor
