@@ -9,12 +9,12 @@ from gapcert.plugin import LazyPackage, homes
 _HOME = homes(
     {
         "gapcert_figures.data": (
-            "Axis Band Channel CompareFigure DiagnosisFigure Escape Figures GapFigure Lane LoopFigure PairFigure Runs Slice "
-            "WinningFigure drawn gap_figure loop_figure winning_figure"
+            "Axis Band Channel CompareFigure DiagnosisFigure Escape Figures GapFigure Lane LoopFigure PairFigure "
+            "RecordedFigure Runs Slice Stretch WinningFigure drawn gap_figure held labelled loop_figure recorded_figure "
+            "winning_figure"
         ),
         "gapcert_figures.diagnosis": "KINDS Correlation Course Law Signal Waterfall called spoken",
         "gapcert_figures.playback": "Motion Playback channel_playback loop_playback state_playback",
-        "gapcert_figures.recording": "RecordedFigure Stretch recorded_figure",
     }
 )
 

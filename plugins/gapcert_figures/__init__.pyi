@@ -9,12 +9,17 @@ from gapcert_figures.data import GapFigure as GapFigure
 from gapcert_figures.data import Lane as Lane
 from gapcert_figures.data import LoopFigure as LoopFigure
 from gapcert_figures.data import PairFigure as PairFigure
+from gapcert_figures.data import RecordedFigure as RecordedFigure
 from gapcert_figures.data import Runs as Runs
 from gapcert_figures.data import Slice as Slice
+from gapcert_figures.data import Stretch as Stretch
 from gapcert_figures.data import WinningFigure as WinningFigure
 from gapcert_figures.data import drawn as drawn
 from gapcert_figures.data import gap_figure as gap_figure
+from gapcert_figures.data import held as held
+from gapcert_figures.data import labelled as labelled
 from gapcert_figures.data import loop_figure as loop_figure
+from gapcert_figures.data import recorded_figure as recorded_figure
 from gapcert_figures.data import winning_figure as winning_figure
 from gapcert_figures.diagnosis import KINDS as KINDS
 from gapcert_figures.diagnosis import Correlation as Correlation
@@ -29,6 +34,3 @@ from gapcert_figures.playback import Playback as Playback
 from gapcert_figures.playback import channel_playback as channel_playback
 from gapcert_figures.playback import loop_playback as loop_playback
 from gapcert_figures.playback import state_playback as state_playback
-from gapcert_figures.recording import RecordedFigure as RecordedFigure
-from gapcert_figures.recording import Stretch as Stretch
-from gapcert_figures.recording import recorded_figure as recorded_figure

@@ -20,19 +20,28 @@ from .dataclass_io import flatten, restore
 from .diagnosis import DiagnosisFigure as DiagnosisFigure
 from .playback import Channel as Channel
 from .playback import Playback
-from .recording import RecordedFigure as RecordedFigure
 from .region_outlines import Outline, outlines_of
-from .stage_lanes import Lane as Lane
 
 if TYPE_CHECKING:
     from gapcert.plugin import Box, Certificate, Controller, Domain, System
+    from gapcert_calibrate import CalibratedRecording
     from gapcert_closed_loop import ClosedLoop, Trace
 
 SLICE = 96  # cells per axis of a gap slice
 LINE = 401  # points of a band
 STEPS = 300_000  # engine steps that a slice may cost
 TRACES = 6  # runs drawn per controller
-Residuals = Callable[[Array], Array]
+SHOWN = 400  # transitions of a stretch
+
+
+def labelled(name: str, unit: str) -> str:
+    """`theta [rad]`; the name alone where there is no unit."""
+    return name if unit in ("", "1") else f"{name} [{unit}]"
+
+
+def held(fixed: str) -> str:
+    """Where a picture is taken, ` at torque = 0 N·m`; nothing where no axis is held."""
+    return f" at {fixed}" if fixed else ""
 
 
 @final
@@ -50,6 +59,10 @@ class Axis:
     def all_of(cls, box: Box) -> tuple[Axis, ...]:
         ends = zip(box.axes, box.low, box.high, strict=True)
         return tuple(cls(a.name, pretty(a.unit), low, high, a.kind == "angle") for a, low, high in ends)
+
+    @property
+    def label(self) -> str:
+        return labelled(self.name, self.unit)
 
     def centres(self, n: int) -> Array:
         return np.asarray(self.low + (self.high - self.low) * (2 * np.arange(n) + 1) / (2 * n))
@@ -83,6 +96,10 @@ class Band:
     gamma: Array
     constant: float
 
+    @property
+    def inside(self) -> bool:
+        return bool(np.all((self.low <= self.residual) & (self.residual <= self.high)))
+
 
 @final
 @dataclass(frozen=True)
@@ -97,6 +114,38 @@ class GapFigure:
     slices: tuple[Slice, ...]
     bands: tuple[Band, ...]
     samples: Array
+
+    @property
+    def leads(self) -> dict[str, int]:
+        """The band that each state is shown by: along the axis where it leaves it, or else varies most."""
+        leads: dict[str, int] = {}
+        for i in sorted(range(len(self.bands)), key=lambda i: (self.bands[i].inside, -np.ptp(self.bands[i].residual))):
+            leads.setdefault(self.bands[i].state, i)
+        return {b.state: leads[b.state] for b in self.bands}
+
+
+@final
+@dataclass(frozen=True)
+class Stretch:
+    """One state's residual r in [low, high] at times t (n,), in s from the beginning of the stretch."""
+
+    state: str
+    unit: str
+    t: Array
+    residual: Array
+    low: Array
+    high: Array
+
+
+@final
+@dataclass(frozen=True)
+class RecordedFigure:
+    """Scores of the held windows in order, (n,), of which the one of `rank` (from 1) set the band; and its transitions."""
+
+    scores: Array
+    rank: int
+    at: float
+    stretches: tuple[Stretch, ...]
 
 
 @final
@@ -117,6 +166,14 @@ class WinningFigure:
     outlines: tuple[Outline, ...]
     labels: tuple[str, ...] = ("with γ", "without γ")
 
+    @property
+    def areas(self) -> tuple[tuple[str, str, npt.NDArray[np.bool_]], ...]:
+        """(role, name, where) of what both win, and of what one wins alone."""
+        a, b = self.with_gamma > 0, self.without_gamma > 0
+        first, second = self.labels
+        only = ("only_with_gamma", f"only {first}", a & ~b), ("only_without_gamma", f"only {second}", b & ~a)
+        return ("both", "both win", a & b), *only
+
 
 @final
 @dataclass(frozen=True)
@@ -135,6 +192,16 @@ class Runs:
     traces: Array
     ended: Array
     predicted: Array
+
+    @property
+    def name(self) -> str:
+        return "with γ" if self.gamma else "without γ"
+
+    @property
+    def alive(self) -> npt.NDArray[np.intp]:
+        """(steps + 1,): how many are unbroken at each step."""
+        broke = np.where(self.broke < 0, self.steps + 1, self.broke)
+        return np.asarray((broke[None] > np.arange(self.steps + 1)[:, None]).sum(axis=1))
 
 
 @final
@@ -209,6 +276,22 @@ class CompareFigure:
 
 @final
 @dataclass(frozen=True)
+class Lane:
+    """The states of one stage, each from the event with that number on."""
+
+    stage: str
+    at: tuple[int, ...]
+    states: tuple[str, ...]
+
+    def then(self, number: int, state: str) -> Lane:
+        """This lane with a new state; the same state again changes nothing."""
+        if self.states and self.states[-1] == state:
+            return self
+        return Lane(self.stage, (*self.at, number), (*self.states, state))
+
+
+@final
+@dataclass(frozen=True)
 class Figures:
     """Everything that a run drew."""
 
@@ -240,13 +323,9 @@ class Figures:
             raise UsageError(f"{what}; run the spec again") from error
 
 
-def _middle(axes: Sequence[Axis]) -> Array:
-    return np.array([(a.low + a.high) / 2 for a in axes])
-
-
-def _plane(axes: Sequence[Axis], n: int, at: Array | None = None) -> Array:
-    """Cell centres of n × n cells over the first two axes, the others `at` a point, or their middle: (n², axes)."""
-    points = np.tile(_middle(axes) if at is None else at, (n * n, 1))
+def _plane(axes: Sequence[Axis], n: int, at: Array) -> Array:
+    """Cell centres of n × n cells over the first two axes, the others as `at` a point: (n², axes)."""
+    points = np.tile(at, (n * n, 1))
     second, first = np.meshgrid(axes[1].centres(n), axes[0].centres(n), indexing="ij")
     points[:, 0], points[:, 1] = first.ravel(), second.ravel()
     return points
@@ -256,18 +335,17 @@ def _held(axes: Sequence[Axis], at: Array) -> str:
     return ", ".join(f"{a.name} = {m:.4g} {a.unit}".removesuffix(" 1") for a, m in zip(axes, at, strict=True))
 
 
-def _fineness(residual: Residuals) -> tuple[int, int]:
-    """(cells per axis of a slice, points of a band): fewer where a transition takes many engine steps."""
-    substeps = getattr(getattr(residual, "backend", None), "substeps", 1)
-    return int(np.clip(np.sqrt(STEPS / substeps), SLICE // 3, SLICE)), int(np.clip(STEPS / 10 / substeps, LINE // 4, LINE))
-
-
-def gap_figure(certificate: Certificate, residual: Residuals, domain: Domain) -> GapFigure:
+def gap_figure(certificate: Certificate, residual: Callable[[Array], Array], domain: Domain) -> GapFigure:
     """Slices over the first two axes and bands along every axis, with the residual evaluated afresh, inside Z alone."""
     axes = Axis.all_of(domain.states) + Axis.all_of(domain.inputs)
     states, centre = axes[: domain.nx], domain.centre
     constants = certificate.summary()["states"]
-    side, points = _fineness(residual)
+    # Fewer cells per axis of a slice, and points of a band, where a transition takes many engine steps.
+    substeps = getattr(getattr(residual, "backend", None), "substeps", 1)
+    side, points = (
+        int(np.clip(np.sqrt(STEPS / substeps), SLICE // 3, SLICE)),
+        int(np.clip(STEPS / 10 / substeps, LINE // 4, LINE)),
+    )
     inert = certificate.problem.symmetry.axes if certificate.problem.symmetry is not None else ()
     bands: list[Band] = []
     for j, axis in enumerate(axes):
@@ -295,6 +373,25 @@ def gap_figure(certificate: Certificate, residual: Residuals, domain: Domain) ->
     return GapFigure(shown, _held(shown[2:], centre[order][2:]), tuple(slices), tuple(bands), certificate.samples.z[:, order])
 
 
+def recorded_figure(made: CalibratedRecording) -> RecordedFigure:
+    """Of the window that set the band, the stretch around the transition that did."""
+    held, order = made.held, np.argsort(made.scores, kind="stable")
+    rows = np.flatnonzero(held.window == np.unique(held.window)[order[made.rank - 1]])
+    rows = rows[np.argsort(held.t[rows], kind="stable")]
+    low, high = made.gap.interval(held.z[rows])
+    r = held.r[rows]
+    # The score's transition touches the band: nowhere is less left, in scales.
+    peak = int(np.argmin((np.minimum(r - low, high - r) / made.scale).min(axis=1)))
+    first = max(0, min(peak - SHOWN // 2, len(rows) - SHOWN))
+    part = slice(first, first + SHOWN)
+    t = held.t[rows][part]
+    stretches = (
+        Stretch(s.name, pretty(s.unit), t - t[0], r[part, i], low[part, i], high[part, i])
+        for i, s in enumerate(made.model.states)
+    )
+    return RecordedFigure(made.scores[order], made.rank, float(t[0]), tuple(stretches))
+
+
 def winning_figure(
     with_gamma: Controller,
     without_gamma: Controller,
@@ -310,7 +407,7 @@ def winning_figure(
     own = {} if held is None else dict(zip(held.names, np.add(held.low, held.high) / 2, strict=True))
     if len(axes) < 2 or axes[0].name in own or axes[1].name in own:
         return None
-    at = np.array([own.get(a.name, m) for a, m in zip(axes, _middle(axes), strict=True)])
+    at = np.array([own.get(a.name, (a.low + a.high) / 2) for a in axes])
     n = min(with_gamma.resolution, without_gamma.resolution)
     with_grid, without_grid = _grids((with_gamma, without_gamma), axes, n, at, tell)
     if not (with_grid.any() or without_grid.any()):
@@ -323,8 +420,8 @@ def winning_figure(
     goal, value = with_gamma.goal, getattr(with_gamma, "value", None)
     steps = np.empty((0, 0)) if value is None else value(_plane(axes, n, at)).reshape(n, n).astype(np.float64)
     values = np.where(steps < 0, np.nan, steps) if (steps > 0).any() else np.empty((0, 0))
-    outlines = outlines_of(goal, at)
-    return WinningFigure(axes, _held(axes[2:], at[2:]), goal.kind, with_grid, without_grid, values, outlines, labels)
+    fixed, outlines = _held(axes[2:], at[2:]), outlines_of(goal, at)
+    return WinningFigure(axes, fixed, goal.kind, with_grid, without_grid, values, outlines, labels)
 
 
 def _grids(both: Sequence[Controller], axes: Sequence[Axis], n: int, at: Array, tell: Callable[[int, int], None]) -> Array:
@@ -336,16 +433,11 @@ def _grids(both: Sequence[Controller], axes: Sequence[Axis], n: int, at: Array, 
     return grids
 
 
-def _grid(controller: Controller, axes: Sequence[Axis], n: int, at: Array | None = None) -> Array:
-    return controller.contains(_plane(axes, n, at)).reshape(n, n).astype(np.float64)
-
-
 def loop_figure(loop: ClosedLoop, model: System, with_gamma: Controller, without_gamma: Controller) -> LoopFigure:
     """The headline runs of both controllers; drawn are the same few starts, those that break without γ first."""
     first = drawn(loop)
-    both = ((False, loop.without_gamma), (True, loop.with_gamma))
-    stay = without_gamma.goal.stay
-    runs = tuple(_runs(gamma, loop.policy, trace, model, first, stay) for gamma, trace in both)
+    both, stay = (loop.without_gamma, loop.with_gamma), without_gamma.goal.stay
+    runs = tuple(_runs(gamma, loop.policy, trace, model, first, stay) for gamma, trace in zip((False, True), both, strict=True))
     escape = _escape(loop.without_gamma, int(first[0]), model, without_gamma)
     told, ahead = foreseen(with_gamma, loop.with_gamma.x[int(first[0])], loop.policy)
     ends, known = np.column_stack([stay.low, stay.high]), learned_figures(loop.with_gamma.learned, model, int(first[0]))
@@ -369,11 +461,10 @@ def _escape(trace: Trace, row: int, model: System, controller: Controller) -> Es
         return None
     middle, reach = (expected + x[end]) / 2, 2.5 * np.abs(expected - x[end])
     reach = np.maximum(reach, 1e-3 * reach.max())
-    box = controller.goal.stay
-    axes = tuple(
-        Axis(a.name, pretty(a.unit), low, high) for a, low, high in zip(box.axes, middle - reach, middle + reach, strict=True)
-    )
-    inside = _grid(controller, axes, min(SLICE, controller.resolution))
+    ends = zip(controller.goal.stay.axes, middle - reach, middle + reach, strict=True)
+    axes = tuple(Axis(a.name, pretty(a.unit), low, high) for a, low, high in ends)
+    n = min(SLICE, controller.resolution)
+    inside = controller.contains(_plane(axes, n, middle)).reshape(n, n).astype(np.float64)
     return Escape(axes, inside, end, x[end - 1], expected, x[end])
 
 

@@ -31,10 +31,6 @@ def called(effect: str, site: str) -> str:
     return f"parameter {site}" if effect == "parameter" else f"{spoken(effect)} at {site}"
 
 
-def _none() -> Array:
-    return np.empty(0)
-
-
 @final
 @dataclass(frozen=True)
 class Law:
@@ -53,8 +49,8 @@ class Law:
     y: Array
     at: Array
     law: Array
-    half: Array = field(default_factory=_none)
-    rising: Array = field(default_factory=_none)
+    half: Array = field(default_factory=lambda: np.empty(0))
+    rising: Array = field(default_factory=lambda: np.empty(0))
     shape: str = "line"
     lead: bool = True
     named: str = "named law"

@@ -58,9 +58,8 @@ def loop_playback(loop: ClosedLoop, system: System, row: int) -> Playback | None
 
     Hidden state is handed on along the run once more: a trace keeps the states alone.
     """
-    pairs = (("without γ", loop.without_gamma), ("with γ", loop.with_gamma))
-    found = [(name, trace, _played(system, trace, row)) for name, trace in pairs if row < len(trace.x)]
-    return _playback([(name, scene, t, trace.violation[row]) for name, trace, (scene, t) in found])
+    both = (("without γ", loop.without_gamma), ("with γ", loop.with_gamma))
+    return _playback([(name, *_played(system, one, row), one.violation[row]) for name, one in both if row < len(one.x)])
 
 
 def channel_playback(channels: Sequence[Channel], systems: Sequence[System]) -> Playback | None:

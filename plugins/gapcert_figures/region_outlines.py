@@ -9,10 +9,17 @@ from typing import final
 
 import numpy as np
 
-from gapcert.plugin import TURN, Array, Box, Ellipsoid, Goal, Polytope, Region, turned
+from gapcert.plugin import TURN, Array, Box, Ellipsoid, Goal, Polytope, turned
 
 ROUND = 180  # corners that an ellipse is drawn with
 _FLAT = 1e-9  # of the box: nearer corners lie on one side
+_NOTHING = np.empty((0, 2))
+_DRAWN = {
+    "stay": ("ink", "to stay in"),
+    "avoid": ("bad", "avoid"),
+    "target": ("good", "target"),
+    "region": ("good", "named region"),
+}
 
 Part = Box | Polytope | Ellipsoid
 
@@ -50,13 +57,9 @@ def outlines_of(goal: Goal, at: Array) -> tuple[Outline, ...]:
     parts += [("region", name, region) for name, region in zip(names, goal.regions, strict=True)]
     found = [Outline("stay", "", "everywhere", _corners(goal.stay))]
     for role, name, region in parts:
-        for part in _parts(region) if region is not None else ():
+        for part in (*region.boxes, *region.shapes) if region is not None else ():
             found += [Outline(role, name, where, points) for where, points in _drawn(part, goal.stay, at)]
     return tuple(found)
-
-
-def _parts(region: Region) -> tuple[Part, ...]:
-    return (*region.boxes, *region.shapes)
 
 
 def _drawn(part: Part, stay: Box, at: Array) -> Iterator[tuple[str, Array]]:
@@ -64,7 +67,7 @@ def _drawn(part: Part, stay: Box, at: Array) -> Iterator[tuple[str, Array]]:
     cut, shadow = section(part, at), projection(part)
     if _same(part, hull, stay):
         kinds = [("everywhere", shadow)]
-    elif cut is None or len(cut) < 3:
+    elif len(cut) < 3:
         kinds = [("elsewhere", shadow)]
     else:
         kinds = [("section", cut), ("shadow", shadow)]
@@ -98,19 +101,19 @@ def _turns(hull: Box, stay: Box) -> Iterator[Array]:
         yield TURN * np.array(turns, dtype=np.float64)
 
 
-def section(part: Part, at: Array) -> Array | None:
-    """Corners (k, 2) of what is left of a part over the first two states with the others as in `at` (nx,); None if nothing."""
+def section(part: Part, at: Array) -> Array:
+    """Corners (k, 2) of what is left of a part over the first two states with the others as in `at` (nx,)."""
     hull = part if isinstance(part, Box) else part.box
     at = turned(hull, np.asarray(at, dtype=np.float64)[None])[0]
     if any(not low <= v <= high for v, low, high in zip(at[2:], hull.low[2:], hull.high[2:], strict=True)):
-        return None
-    points: Array | None = _corners(hull)
+        return _NOTHING
+    points = _corners(hull)
     if isinstance(part, Polytope):
         for a, b in zip(part.zone.matrix, part.zone.bounds, strict=True):
             points = _clip(points, a[:2], b - a[2:] @ at[2:])
     elif isinstance(part, Ellipsoid):
         points = _ellipse(part, at)
-    return None if points is None or not len(points) else points
+    return points
 
 
 def projection(part: Part) -> Array:
@@ -119,9 +122,7 @@ def projection(part: Part) -> Array:
         return _corners(part)
     if isinstance(part, Polytope):
         return _projected(part)
-    found = _ellipse(part, None)
-    assert found is not None, "an ellipsoid has a centre"
-    return found
+    return _ellipse(part, None)
 
 
 def _corners(box: Box) -> Array:
@@ -129,10 +130,10 @@ def _corners(box: Box) -> Array:
     return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]], dtype=np.float64)
 
 
-def _clip(points: Array | None, a: Array, bound: float) -> Array:
+def _clip(points: Array, a: Array, bound: float) -> Array:
     """The corners of a convex polygon's part with a·p ≤ bound."""
-    if points is None or not len(points):
-        return np.empty((0, 2))
+    if not len(points):
+        return _NOTHING
     over = points @ a - bound
     kept: list[Array] = []
     for p, q, v, w in zip(points, np.roll(points, -1, axis=0), over, np.roll(over, -1), strict=True):
@@ -143,7 +144,7 @@ def _clip(points: Array | None, a: Array, bound: float) -> Array:
     return np.array(kept).reshape(-1, 2)
 
 
-def _ellipse(e: Ellipsoid, at: Array | None) -> Array | None:
+def _ellipse(e: Ellipsoid, at: Array | None) -> Array:
     """The section at `at`, or the projection: with M = [[A, B], [Bᵀ, C]] the first has the form A, the second A − B C⁻¹ Bᵀ."""
     m, centre = np.asarray(e.matrix), np.asarray(e.centre)
     drawn, rest = ([i for i, j in enumerate(e.on) if (j < 2) == first] for first in (True, False))
@@ -156,7 +157,7 @@ def _ellipse(e: Ellipsoid, at: Array | None) -> Array | None:
         shift = np.linalg.solve(a, b @ r)
         middle, level = middle - shift, float(1 - r @ c @ r + (b @ r) @ shift)
     if level < 0:
-        return None
+        return _NOTHING
     if len(drawn) == 2:
         t = TURN * np.arange(ROUND) / ROUND
         return np.asarray(middle + np.sqrt(level) * np.linalg.solve(np.linalg.cholesky(a).T, [np.cos(t), np.sin(t)]).T)
@@ -188,6 +189,6 @@ def _projected(p: Polytope) -> Array:
 
     left, right = farthest(np.array([-1.0, 0.0])), farthest(np.array([1.0, 0.0]))
     if np.isnan(left).any():
-        return np.empty((0, 2))
+        return _NOTHING
     around = np.array([left, *beyond(left, right), right, *beyond(right, left)])
     return np.asarray(around * width[:2] + low[:2])

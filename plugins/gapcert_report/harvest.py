@@ -49,18 +49,16 @@ def name_classes(image: AxesImage, names: Sequence[str]) -> None:
     setattr(image, _CLASSES, list(names))
 
 
-def take_legends(figure: Figure, ax: Axes) -> tuple[Entry, ...]:
-    """The entries of all legends, which are taken off the picture: the page shows them, where they wrap and can be pressed."""
-    inner = ax.get_legend()
-    legends = [*figure.legends, *([inner] if inner else [])]
-    found = [
-        Entry(text.get_text(), variables(_swatch(handle)))
-        for one in legends
-        for text, handle in zip(one.get_texts(), one.legend_handles, strict=True)
-    ]
-    for one in legends:
-        one.remove()
-    return tuple(found)
+def legend_of(figure: Figure, handles: Sequence[Any]) -> tuple[Entry, ...]:
+    """An entry per name; the legend itself is not drawn: the page shows it, where it wraps and can be pressed."""
+    named = {str(h.get_label()): h for h in reversed(handles)}
+    if not named:
+        return ()
+    legend = figure.legend(handles=[named[n] for n in dict.fromkeys(str(h.get_label()) for h in handles)])
+    found = zip(legend.get_texts(), legend.legend_handles, strict=True)
+    entries = tuple(Entry(text.get_text(), variables(_swatch(handle))) for text, handle in found)
+    legend.remove()
+    return entries
 
 
 def _swatch(handle: Any) -> str:

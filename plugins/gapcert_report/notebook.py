@@ -177,7 +177,7 @@ def run_html(folder: Path, summary: Summary, runs: Sequence[Summary] = ()) -> st
     from gapcert_figures import Figures
 
     from .pages import compare
-    from .pictures.pictures import album
+    from .pictures.album import album_of
 
     if runs:
         rows = [(r["name"], words.verdict(r)[0], str(r.get("reason") or "")) for r in runs]
@@ -203,7 +203,7 @@ def run_html(folder: Path, summary: Summary, runs: Sequence[Summary] = ()) -> st
     met = f"{sum(bool(e['met']) for e in expected)} of {len(expected)} expectations met. " if expected else ""
     parts.append(h("p", f"{met}Folder: {folder}", class_="note"))
     figures = Figures.load(folder) if folder.is_dir() else Figures()
-    drawn = compare.hero(summary, figures) if "pairs" in summary else album(figures, summary).hero
+    drawn = compare.hero(summary, figures) if "pairs" in summary else album_of(figures, summary).hero
     return shown(said, kind, *parts, pictures=drawn)
 
 
@@ -211,7 +211,7 @@ def recording_html(c: CalibratedRecording) -> str:
     """A certificate of a recording, with the scores of its windows."""
     from gapcert_figures import recorded_figure
 
-    from .pictures.recording import recorded_pictures
+    from .pictures.gap import recorded_pictures
 
     return certificate_html(c.summary(), recorded_pictures(recorded_figure(c)))
 

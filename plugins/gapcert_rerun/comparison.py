@@ -25,16 +25,10 @@ def draw_comparison(canvas: Canvas, comparison: CompareFigure) -> None:
             canvas.show("pair", root, Seen(root, f"{name}{f', {p.fixed}' if p.fixed else ''}", bar=True))
         if p.drift.size:
             # On a linear axis only the order of magnitude shows them all.
-            level, t = (
-                np.log10(np.maximum(p.drift, 1e-18)),
-                _times(comparison, len(p.drift)),
-            )
+            t = comparison.period * np.arange(len(p.drift), dtype=np.float64)
+            level: Array = np.log10(np.maximum(p.drift, 1e-18))
             canvas.line(f"drift/{p.a}-{p.b}", t, level, WITHOUT if p.values.size else GOOD, name)
             end = max(end, float(t[-1]))
     if end:
         title = "How runs come apart: log10 of their difference over one step's motion"
         canvas.show("drift", "drift", series("drift", title, -18.5, 3.0, end))
-
-
-def _times(comparison: CompareFigure, steps: int) -> Array:
-    return np.asarray(comparison.period * np.arange(steps), dtype=np.float64)

@@ -8,35 +8,33 @@ import numpy as np
 import rerun as rr
 
 from gapcert import Array
-from gapcert_figures import LoopFigure, Runs, WinningFigure
+from gapcert_figures import LoopFigure, Runs, WinningFigure, held
 
 from .canvas import Canvas
-from .plane import BAD, FAINT, GOOD, ONLY_WITH, TRUTH, WITH, WITHOUT, Colour, Plane, Seen, named, series
-from .robot import draw_robot
-
-_ROLES = {"stay": TRUTH, "target": GOOD, "avoid": BAD, "region": GOOD}
+from .plane import BAD, FAINT, ONLY_WITH, ROLES, TRUTH, WITH, Colour, Plane, Seen, series
+from .robot import as_path, draw_robot
 
 
 def draw_winning(canvas: Canvas, w: WinningFigure) -> None:
     """Where both controllers win, or one alone; the goal; and how long it takes."""
     plane = Plane(w.axes[0], w.axes[1])
-    a, b = w.with_gamma > 0, w.without_gamma > 0
-    masks = (("both", a & b, WITH), ("only_with_gamma", a & ~b, ONLY_WITH), ("only_without_gamma", b & ~a, WITHOUT))
-    for name, mask, colour in masks:
+    for role, _, mask in w.areas:
         # Darker than the runs that lie upon it.
-        red, green, blue = (c * 2 // 5 for c in colour[:3])
-        canvas.static(f"winning/{name}", plane.mask(mask, (red, green, blue, 255)))
+        red, green, blue = (c * 2 // 5 for c in ROLES[role][:3])
+        canvas.static(f"winning/{role}", plane.mask(mask, (red, green, blue, 255)))
     canvas.static("winning/frame", *plane.frame(""))
-    held = f" at {w.fixed}" if w.fixed else ""
-    roots = {"winning": f"May start: {w.labels[0]} {100 * a.mean():.3g} %, {w.labels[1]} {100 * b.mean():.3g} %{held}"}
+    first, second = (
+        f"{n} {100 * grid.mean():.3g} %" for n, grid in zip(w.labels, (w.with_gamma, w.without_gamma), strict=True)
+    )
+    roots = {"winning": f"May start: {first}, {second}{held(w.fixed)}"}
     if w.values.size:
-        roots["promise"], top = f"Steps that are promised{held}", float(np.nanmax(w.values))
+        roots["promise"], top = f"Steps that are promised{held(w.fixed)}", float(np.nanmax(w.values))
         canvas.static("promise/steps", plane.heat(w.values, top))
         canvas.static("promise/frame", *plane.frame(""))
         canvas.static("promise/scale", *plane.scale(top, "steps"))
     for root, title in roots.items():
         for k, o in enumerate(o for o in w.outlines if o.cut):
-            colour = FAINT if o.dotted else _ROLES[o.role]
+            colour = FAINT if o.dotted else ROLES[o.role]
             canvas.static(f"{root}/goal/{o.role}/{k}", plane.polygon(o.points, colour, o.name))
         canvas.show("winning", root, Seen(root, title, bar=root == "promise"))
 
@@ -44,10 +42,8 @@ def draw_winning(canvas: Canvas, w: WinningFigure) -> None:
 def draw_loop(canvas: Canvas, loop: LoopFigure) -> None:
     """Runs over time and over two states; tubes that were foreseen, what was learned, and the robot."""
     for runs in loop.runs:
-        name, colour = ("with_gamma", WITH) if runs.gamma else ("without_gamma", WITHOUT)
-        _runs(canvas, loop, runs, name, colour)
-    last = max(r.steps for r in loop.runs)
-    t = times(loop, last + 1)
+        _runs(canvas, loop, runs)
+    t = times(loop, max(r.steps for r in loop.runs) + 1)
     for m, told in enumerate(loop.foreseen):
         _foreseen(canvas, loop, told, m)
     # Later there is nothing to be seen.
@@ -58,16 +54,13 @@ def draw_loop(canvas: Canvas, loop: LoopFigure) -> None:
             canvas.line(f"{root}/wanted", t[: len(loop.wanted)], loop.wanted[:, i], TRUTH, "wanted", 2.0)
         pad = 0.15 * (high - low)
         for name, limit in (("low", low), ("high", high)):
-            canvas.line(f"{root}/{name}", t, np.full(last + 1, limit), BAD, "limit", 1.0)
-        canvas.show("loop", axis.name, series(root, named(axis), low - pad, high + pad, end))
+            canvas.line(f"{root}/{name}", t, np.full(len(t), limit), BAD, "limit", 1.0)
+        canvas.show("loop", axis.name, series(root, axis.label, low - pad, high + pad, end))
     _ahead(canvas, loop)
     _learned(canvas, loop)
     top = 1.08 * max(r.starts for r in loop.runs)
-    canvas.show(
-        "alive",
-        "alive",
-        series("alive", "Runs unbroken", 0.0, top, max(end, loop.period * max(int(r.broke.max()) for r in loop.runs))),
-    )
+    last = max(end, loop.period * max(int(r.broke.max()) for r in loop.runs))
+    canvas.show("alive", "alive", series("alive", "Runs unbroken", 0.0, top, last))
     if loop.playback is not None:
         draw_robot(canvas, loop.playback)
 
@@ -77,15 +70,13 @@ def times(loop: LoopFigure, steps: int, first: int = 0) -> Array:
     return np.asarray(loop.period * np.arange(first, first + steps), dtype=np.float64)
 
 
-def _runs(canvas: Canvas, loop: LoopFigure, runs: Runs, name: str, colour: Colour) -> None:
-    label, t = name.replace("_gamma", " γ"), times(loop, runs.steps + 1)
+def _runs(canvas: Canvas, loop: LoopFigure, runs: Runs) -> None:
+    name, label, colour, t = as_path(runs.name), runs.name, ROLES[runs.name], times(loop, runs.steps + 1)
     for i, axis in enumerate(loop.axes):
         canvas.line(f"loop/{axis.name}/{name}", t, runs.traces[:, :, i].T, colour, f"f̂, {label}")
         predicted = runs.predicted[:1, :, i].T
         canvas.line(f"loop/{axis.name}/{name}_predicted", t, predicted, FAINT, f"f alone, {label}", 1.0)
-    broke = np.where(runs.broke < 0, runs.steps + 1, runs.broke)
-    alive = (broke[None] > np.arange(runs.steps + 1)[:, None]).sum(axis=1).astype(np.float64)
-    canvas.line(f"alive/{name}", t, alive, colour, label, 3.0)
+    canvas.line(f"alive/{name}", t, runs.alive.astype(np.float64), colour, label, 3.0)
     if len(loop.axes) < 2:
         return
     plane = Plane(loop.axes[0], loop.axes[1])
@@ -134,7 +125,7 @@ def _ahead(canvas: Canvas, loop: LoopFigure) -> None:
         canvas.band(f"{root}/foreseen", t, low, high, ONLY_WITH, "foreseen box", axis.unit)
         canvas.line(f"{root}/error", t, ahead.error[:, i], TRUTH, "where the step led", 1.5)
         reach = 1.15 * max(float(np.abs(v).max()) for v in (low, high, ahead.error[:, i])) or 1.0
-        title = f"Step against its tube: {named(axis)}, {out} of {len(t)} outside"
+        title = f"Step against its tube: {axis.label}, {out} of {len(t)} outside"
         canvas.show("tube", axis.name, series(root, title, -reach, reach, float(t[-1])))
 
 

@@ -12,10 +12,10 @@ from gapcert import Array
 from gapcert_figures import Axis, DiagnosisFigure
 
 from .canvas import Canvas
-from .plane import FAINT, TRUTH, WITH, WITHOUT, Plane, Seen, series
+from .plane import FAINT, ROLES, TRUTH, WITH, Plane, Seen, series
 from .robot import draw_robot
 
-BOTH = (("before", WITHOUT), ("after", WITH))
+BOTH = ("before", "after")
 
 
 def draw_diagnosis(canvas: Canvas, d: DiagnosisFigure) -> None:
@@ -29,9 +29,8 @@ def draw_diagnosis(canvas: Canvas, d: DiagnosisFigure) -> None:
     for one in d.correlations:
         _correlation(canvas, one)
     for i, course in enumerate(d.courses):
-        _course(
-            canvas, f"left/course{i}", course, f"Errors of trajectory {i + 1}" if len(d.courses) > 1 else "Error of each window"
-        )
+        title = f"Errors of trajectory {i + 1}" if len(d.courses) > 1 else "Error of each window"
+        _course(canvas, f"left/course{i}", course, title)
     for s in d.experiment:
         root, reach = f"experiment/{s.name}", 1.1 * float(np.abs(s.values).max() or 1.0)
         canvas.line(f"{root}/signal", s.t, s.values, TRUTH, s.name, 1.0)
@@ -42,16 +41,16 @@ def draw_diagnosis(canvas: Canvas, d: DiagnosisFigure) -> None:
 
 def _channel(canvas: Canvas, c: Any) -> None:
     root, t = f"diagnosis/{c.name}", c.t - c.t[0]
-    for name, values, colour in (("measured", c.measured, TRUTH), ("before", c.before, WITHOUT), ("after", c.after, WITH)):
-        canvas.line(f"{root}/{name}", t, values, colour, name, 3.0 if name == "measured" else 1.5)
+    for name in ("measured", *BOTH):
+        canvas.line(f"{root}/{name}", t, getattr(c, name), ROLES[name], name, 3.0 if name == "measured" else 1.5)
     both = np.concatenate([c.measured, c.after])
     low, high = float(np.nanmin(both)), float(np.nanmax(both))
     pad = 0.1 * (high - low) or 1.0
     title = f"{c.name} [{c.unit}], held out: measured white, before orange, after blue"
     canvas.show("channel", c.name, series(root, title, low - pad, high + pad, float(t[-1])))
     root = f"error/{c.name}"
-    for name, colour in BOTH:
-        canvas.line(f"{root}/{name}", t, getattr(c, name) - c.measured, colour, name)
+    for name in BOTH:
+        canvas.line(f"{root}/{name}", t, getattr(c, name) - c.measured, ROLES[name], name)
     reach = 1.1 * float(np.nanmax(np.abs(c.before - c.measured))) or 1.0
     canvas.show("error", c.name, series(root, f"Error of {c.name} [{c.unit}], held out", -reach, reach, float(t[-1])))
 
@@ -68,8 +67,7 @@ def _law(canvas: Canvas, root: str, law: Any) -> None:
         return plane.at(np.column_stack([x, y]), height)
 
     canvas.static(f"{root}/frame", *plane.frame(""))
-    if (zero := plane.zero()) is not None:
-        canvas.static(f"{root}/zero", zero)
+    canvas.static(f"{root}/zero", *plane.zero())
     ends = [at(np.array([x, x]), np.array([y - h, y + h])) for x, y, h in zip(law.x, law.y, half, strict=True)]
     canvas.static(f"{root}/interval", rr.LineStrips3D(ends, radii=0.002, colors=[FAINT] * len(ends)))
     canvas.static(f"{root}/missing", rr.Points3D(at(law.x, law.y, 0.03), radii=0.009, colors=[TRUTH]))
@@ -108,8 +106,10 @@ def _correlation(canvas: Canvas, c: Any) -> None:
     canvas.static(f"{root}/frame", *plane.frame(""))
     band = np.full_like(c.lag, c.band)
     canvas.static(f"{root}/chance", plane.ribbon(c.lag, -band, band, (60, 64, 72, 255), 0.005))
-    for name, colour in BOTH:
-        canvas.static(f"{root}/{name}", plane.curve(c.lag, getattr(c, name), colour, height=0.02 if name == "before" else 0.03))
+    for name in BOTH:
+        canvas.static(
+            f"{root}/{name}", plane.curve(c.lag, getattr(c, name), ROLES[name], height=0.02 if name == "before" else 0.03)
+        )
     canvas.show("left", root, Seen(root, f"Residual of {c.channel} with {c.against}"))
 
 
@@ -119,6 +119,6 @@ def _course(canvas: Canvas, root: str, course: Any, title: str) -> None:
     plane = Plane(span, Axis("RMS", "noise floors", 0.0, top))
     canvas.static(f"{root}/frame", *plane.frame(""))
     canvas.static(f"{root}/floor", plane.curve(course.t, np.ones_like(course.t), FAINT, 0.0015))
-    for name, colour in BOTH:
-        canvas.static(f"{root}/{name}", plane.curve(course.t, getattr(course, name), colour))
+    for name in BOTH:
+        canvas.static(f"{root}/{name}", plane.curve(course.t, getattr(course, name), ROLES[name]))
     canvas.show("course", root, Seen(root, title))

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import rerun as rr
 
-from gapcert_figures import Axis, Band, GapFigure, RecordedFigure
+from gapcert_figures import Axis, Band, GapFigure, RecordedFigure, held, labelled
 
 from .canvas import Canvas
-from .plane import FAINT, GOOD, STEP, TRUTH, WITH, Colour, Plane, Seen, named, series
+from .plane import FAINT, GOOD, STEP, TRUTH, WITH, Colour, Plane, Seen, series
 
 _TUBE: Colour = (70, 108, 165, 255)
 _REACH: Colour = (36, 54, 82, 255)
@@ -27,15 +25,13 @@ def draw_gap(canvas: Canvas, gap: GapFigure) -> None:
         canvas.static(f"{root}/gamma/frame", *right.frame("certified γ, and samples", left=False))
         canvas.static(f"{root}/scale", *right.scale(top, s.unit))
         canvas.static(f"{root}/gamma/samples", rr.Points3D(right.at(gap.samples), radii=0.005, colors=[(255, 255, 255, 255)]))
-        held = f" at {gap.fixed}" if gap.fixed else ""
-        canvas.show("gap", s.state, Seen(root, f"How wrong: {s.state} [{s.unit}]{held}", 2, bar=True))
-    for state in dict.fromkeys(b.state for b in gap.bands):
-        bands = [b for b in gap.bands if b.state == state]
-        most = max(bands, key=lambda b: float(np.ptp(b.residual)))
-        for b in bands:
-            _band(canvas, f"band/{state}/{b.axis.name}", b)
-        title = f"f̂ − f of {state} along {most.axis.name}, and its band"
-        canvas.show("band", state, Seen(f"band/{state}/{most.axis.name}", title))
+        canvas.show("gap", s.state, Seen(root, f"How wrong: {s.state} [{s.unit}]{held(gap.fixed)}", 2, bar=True))
+    for state, lead in gap.leads.items():
+        for b in gap.bands:
+            if b.state == state:
+                _band(canvas, f"band/{state}/{b.axis.name}", b)
+        axis = gap.bands[lead].axis.name
+        canvas.show("band", state, Seen(f"band/{state}/{axis}", f"f̂ − f of {state} along {axis}, and its band"))
 
 
 def _band(canvas: Canvas, path: str, b: Band) -> None:
@@ -58,7 +54,7 @@ def draw_recorded(canvas: Canvas, f: RecordedFigure) -> None:
     plane = Plane(Axis("held window, from the best to the worst", "", 0, n + 1), Axis("score", "", low - pad, high + pad))
     place = np.column_stack([np.arange(1, n + 1), f.scores])
     canvas.static("scores/frame", *plane.frame(f"rank {f.rank} of {n} sets the band"))
-    _log(canvas, "scores/zero", plane.zero())
+    canvas.static("scores/zero", *plane.zero())
     canvas.static("scores/windows", rr.Points3D(plane.at(place), radii=0.005, colors=[WITH]))
     canvas.static("scores/rank", rr.Points3D(plane.at(place[f.rank - 1 : f.rank], 0.03), radii=0.014, colors=[GOOD]))
     canvas.show("scores", "scores", Seen("scores", "How far each window leaves the band of the fit, in scales"))
@@ -67,10 +63,5 @@ def draw_recorded(canvas: Canvas, f: RecordedFigure) -> None:
         bottom, top = float(every.min()), float(every.max())
         canvas.band(f"{root}/band", s.t, s.low, s.high, WITH, "[l, u]", s.unit)
         canvas.line(f"{root}/residual", s.t, s.residual, TRUTH, "x⁺ − f", 2.0)
-        pad, title = 0.1 * (top - bottom) or 1.0, f"gap of {named(Axis(s.state, s.unit, 0, 1))} as measured (white) in its band"
+        pad, title = 0.1 * (top - bottom) or 1.0, f"gap of {labelled(s.state, s.unit)} as measured (white) in its band"
         canvas.show("stretch", s.state, series(root, title, bottom - pad, top + pad, float(s.t[-1])))
-
-
-def _log(canvas: Canvas, path: str, what: Any) -> None:
-    if what is not None:
-        canvas.static(path, what)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, final
 
@@ -16,6 +17,12 @@ from gapcert_figures import Axis
 Colour = tuple[int, int, int, int]
 WITH, WITHOUT, TRUTH, FAINT = (110, 168, 255, 255), (255, 154, 77, 255), (240, 240, 240, 255), (150, 156, 166, 255)
 ONLY_WITH, GOOD, BAD = (60, 190, 178, 255), (95, 209, 151, 255), (255, 105, 120, 255)
+ROLES: Mapping[str, Colour] = {
+    "with γ": WITH, "without γ": WITHOUT, "measured": TRUTH, "before": WITHOUT, "after": WITH,
+    "stay": TRUTH, "avoid": BAD, "target": GOOD, "region": GOOD,
+    "both": WITH, "only_with_gamma": ONLY_WITH, "only_without_gamma": WITHOUT,
+}  # fmt: skip
+"""What figures name, in its colour."""
 _TALL = 1.3  # a square with its names above and below
 _SEEN = 1.02  # of a distance, how much the camera sees from top to bottom
 STEP = 1.3  # from one square to the next
@@ -40,19 +47,17 @@ class Plane:
         """The outline, its title, and the names and ends of its sides; left: those of y, too."""
         s, x, y = self.shift, self.x, self.y
         corners = np.asarray([[s, 0, 0], [s + 1, 0, 0], [s + 1, 1, 0], [s, 1, 0], [s, 0, 0]])
-        marks = [(s + 0.5, -0.01, named(x)), (s, -0.01, ends(x)[0]), (s + 1, -0.01, ends(x)[1])]
+        marks = [(s + 0.5, -0.01, x.label), (s, -0.01, ends(x)[0]), (s + 1, -0.01, ends(x)[1])]
         if title:
             marks.append((s + 0.6, 1.1, title))
         if left:
-            marks += [(s - 0.1, 1.1, named(y)), (s - 0.14, 0.05, ends(y)[0]), (s - 0.14, 0.99, ends(y)[1])]
+            marks += [(s - 0.1, 1.1, y.label), (s - 0.14, 0.05, ends(y)[0]), (s - 0.14, 0.99, ends(y)[1])]
         return [rr.LineStrips3D([corners], colors=[FAINT], radii=0.003), texts(marks)]
 
-    def zero(self) -> rr.LineStrips3D | None:
+    def zero(self) -> list[Any]:
         """The line y = 0, where it is inside."""
-        if not self.y.low < 0 < self.y.high:
-            return None
         line = self.at(np.array([[self.x.low, 0.0], [self.x.high, 0.0]]), 0.005)
-        return rr.LineStrips3D([line], colors=[FAINT], radii=0.001)
+        return [rr.LineStrips3D([line], colors=[FAINT], radii=0.001)] if self.y.low < 0 < self.y.high else []
 
     def heat(self, values: Array, top: float) -> rr.GridMap:
         """Values (n, n), row = y, from 0 to `top`, as colours; nothing where there is no value (NaN)."""
@@ -72,7 +77,7 @@ class Plane:
         place, colours = [self.shift + 1.1, 0.0, 0.0], rr.components.Colormap.Viridis
         bar = rr.GridMap(data=level.tobytes(), format=kind, cell_size=1 / 256, translation=place, colormap=colours)
         x = self.shift + 1.2
-        return [bar, texts([(x, 1.1, f"{top:.3g}{_unit(unit)}"), (x, 0.05, "0")])]
+        return [bar, texts([(x, 1.1, f"{top:.3g} {unit}".removesuffix(" 1").rstrip()), (x, 0.05, "0")])]
 
     def mask(self, values: npt.NDArray[np.bool_], colour: Colour) -> rr.GridMap:
         """The cells (n, n) that are set, in one colour."""
@@ -107,16 +112,8 @@ class Plane:
         return rr.Mesh3D(vertex_positions=edge, triangle_indices=faces, albedo_factor=colour)
 
 
-def named(axis: Axis) -> str:
-    return f"{axis.name} [{axis.unit}]" if axis.unit not in ("", "1") else axis.name
-
-
 def ends(axis: Axis) -> tuple[str, str]:
     return f"{axis.low:.3g}", f"{axis.high:.3g}"
-
-
-def _unit(unit: str) -> str:
-    return "" if unit in ("", "1") else f" {unit}"
 
 
 def texts(marks: list[tuple[float, float, str]]) -> rr.Points3D:

@@ -14,7 +14,7 @@ from gapcert.plugin import Shape
 from gapcert_figures import Motion, Playback
 
 from .canvas import Canvas
-from .plane import BAD, TRUTH, WITH, WITHOUT
+from .plane import BAD, ROLES
 
 _ASIDE, _ABOVE, _AWAY = 0.4, 0.3, 2.1
 _GHOST = 0.35
@@ -26,7 +26,7 @@ def draw_robot(canvas: Canvas, played: Playback) -> None:
     by_name = {m.name: m for m in played.motions}
     eye = _eye(played)
     for motion in played.motions:
-        root = f"robot/{_path(motion.name)}"
+        root = f"robot/{as_path(motion.name)}"
         _log(canvas, root, played, motion)
         if motion.name == "measured":
             continue
@@ -38,7 +38,8 @@ def draw_robot(canvas: Canvas, played: Playback) -> None:
     canvas.plays = True
 
 
-def _path(name: str) -> str:
+def as_path(name: str) -> str:
+    """What a motion is called in a recording: `with_gamma`."""
     return name.replace(" γ", "_gamma")
 
 
@@ -51,7 +52,7 @@ def _title(motion: Motion, beside: bool) -> str:
 
 
 def _log(canvas: Canvas, root: str, played: Playback, motion: Motion) -> None:
-    tint = {"measured": TRUTH, "before": WITHOUT, "after": WITH, "without γ": WITHOUT, "with γ": WITH}[motion.name]
+    tint = ROLES[motion.name]
     reach = 1.2 * max(float(np.abs(_places(played, m)[:, :2]).max(initial=0.0)) for m in played.motions)
     for i, link in enumerate(played.links):
         shapes = [s for s in played.shapes if s.link == i]

@@ -147,7 +147,7 @@ def page_of_a_recording(small_run, tmp_path):
     """As if a recording had set the band."""
     import numpy as np
 
-    from gapcert_figures.recording import RecordedFigure, Stretch
+    from gapcert_figures.data import RecordedFigure, Stretch
 
     t = np.linspace(0, 1, 20)
     stretches = tuple(Stretch(n, "rad", t, 0.1 * np.sin(t), -0.2 + 0 * t, 0.2 + 0 * t) for n in ("theta", "omega"))

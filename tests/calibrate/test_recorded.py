@@ -13,8 +13,8 @@ import gapcert as gc
 from gapcert.numerics.order_statistics import DRAWN_WINDOWS
 from gapcert.testing.toys import Drift
 from gapcert_calibrate.windows import Windows
-from gapcert_figures.recording import SHOWN, recorded_figure
-from gapcert_report.pictures.recording import recorded_pictures
+from gapcert_figures.data import SHOWN, recorded_figure
+from gapcert_report.pictures.gap import recorded_pictures
 from gapcert_verify.verify import verify_run
 
 ROOT = Path(__file__).parents[2]

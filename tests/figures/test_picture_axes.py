@@ -18,7 +18,7 @@ from gapcert_report.pictures.diagnosis import (
     gain_picture,
     law_picture,
 )
-from gapcert_report.pictures.pictures import escape_picture
+from gapcert_report.pictures.loop import escape_picture
 from gapcert_report.pictures.svg import draw
 
 

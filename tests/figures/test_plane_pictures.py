@@ -11,7 +11,7 @@ from gapcert_cells import AutomatonController, GridController
 from gapcert_figures import Axis, LoopFigure, WinningFigure
 from gapcert_figures.data import Figures, Runs, winning_figure
 from gapcert_figures.region_outlines import outlines_of
-from gapcert_report.pictures.pictures import trace_picture
+from gapcert_report.pictures.loop import trace_picture
 from gapcert_report.pictures.plane import runs_picture, value_picture, winning_picture
 
 AXES = (StateSpec("h", "rad", "angle"), StateSpec("x", "m"), StateSpec("z", "m"))

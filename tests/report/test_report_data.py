@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 import gapcert as gc
 from gapcert_figures.data import Figures
 from gapcert_report.pages.packed import packed, unpacked
-from gapcert_report.pictures.pictures import album, band_pictures, slice_pictures
+from gapcert_report.pictures.album import album_of
+from gapcert_report.pictures.gap import band_pictures, slice_pictures
 from gapcert_report.pictures.svg import draw, heat
 from gapcert_report.report import write_report
 from gapcert_report.words.words import tightness_sentence
@@ -84,7 +85,7 @@ def test_a_map_is_read_off_as_it_is(small_run):
 
 @pytest.mark.exam
 def test_every_picture_of_a_run_has_values_and_its_series_have_names(small_run):
-    made = album(Figures.load(small_run.folder), small_run.summary)
+    made = album_of(Figures.load(small_run.folder), small_run.summary)
     pictures = [p for part in (made.hero, made.pairs, made.bands, made.other_axes, made.loop) for p in part]
     assert len(pictures) >= 8
     for p in pictures:
@@ -101,11 +102,11 @@ def test_lines_without_a_name_go_with_those_that_look_alike():
         ax.plot([0, 1], [0, 1], color="red", label="runs")
         ax.plot([0, 1], [1, 2], color="red")
         ax.plot([0, 1], [1, 2], color="blue")
-        ax.legend()
 
     picture = draw("k", "t", "c", on)
     assert [(s["name"], len(s["parts"])) for s in picture.data["series"]] == [("runs", 2)]
-    assert "legend" not in picture.svg
+    assert [e.name for e in picture.legend] == ["runs"]
+    assert "runs" not in picture.svg
 
 
 def test_an_axis_of_names_has_nothing_to_be_read_off():

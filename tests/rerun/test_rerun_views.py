@@ -19,9 +19,8 @@ import gapcert as gc
 import gapcert_figures
 from gapcert_closed_loop.parameter_sets import Learned
 from gapcert_closed_loop.prediction import Ahead, Foreseen
-from gapcert_figures.data import Axis, CompareFigure, Figures, LoopFigure, PairFigure, Runs
+from gapcert_figures.data import Axis, CompareFigure, Figures, LoopFigure, PairFigure, RecordedFigure, Runs, Stretch
 from gapcert_figures.playback import Motion, Playback
-from gapcert_figures.recording import RecordedFigure, Stretch
 from gapcert_figures.region_outlines import Outline
 
 CLI = [sys.executable, "-m", "rerun"]

@@ -12,7 +12,7 @@ from gapcert.plugin import DAMAGE, times
 from gapcert_closed_loop import broken_sentence
 from gapcert_figures import Figures
 from gapcert_report.links import contents, neighbours
-from gapcert_report.pictures import pictures
+from gapcert_report.pictures.album import Album, album_of
 from gapcert_report.words import words
 from gapcert_report.words.diagnosis import cause_name, sentence, whole
 from gapcert_report.words.words import number
@@ -155,7 +155,7 @@ def beside(summary: Summary) -> Html | None:
     return h("section", h("h2", "The same question by another route"), table("Sampling included", columns, cells))
 
 
-def how_wrong(summary: Summary, figures: Figures, album: pictures.Album) -> Html | None:
+def how_wrong(summary: Summary, figures: Figures, album: Album) -> Html | None:
     """The certificate: table, pictures, assumptions, what was spent, and the audit."""
     c = summary.get("certificate")
     if not c:
@@ -260,7 +260,7 @@ def compared(summary: Summary, figures: Figures) -> Html | None:
     return join(p for p in found if p is not None)
 
 
-def controller(summary: Summary, album: pictures.Album) -> Html | None:
+def controller(summary: Summary, album: Album) -> Html | None:
     """The controller and its runs, all policies, and which of them fail without γ."""
     c, loop = summary.get("controller"), summary.get("closed_loop")
     if not (c or loop):
@@ -391,7 +391,7 @@ def page(summary: Summary, figures: Figures, folder: Path, version: str) -> Html
     """The whole document."""
     name = str(summary.get("name", folder.name))
     title = f"{name}: {words.verdict(summary)[0].lower()}"
-    album = pictures.album(figures, summary)
+    album = album_of(figures, summary)
     first = compare.hero(summary, figures) if "pairs" in summary else album.hero
     parts = [
         answer(summary), tiles(summary), h("h2", "At a glance", class_="unseen") if first else None, gallery(first),

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gapcert_figures import CompareFigure, PairFigure
+from gapcert_figures import CompareFigure, PairFigure, held
 from gapcert_report.words.compare import apart, made, setting_name, share
 
-from .svg import FAINT, GOOD, WITH, WITHOUT, Picture, draw, figure_of, heat, scaled
+from .svg import FAINT, GOOD, WITH, WITHOUT, Picture, draw, heat, scaled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -66,17 +66,14 @@ def drift_picture(summary: Summary, figure: CompareFigure) -> Picture | None:
     differing = {(p["a"], p["b"]) for p in apart(summary)}
 
     def on(ax: Axes) -> None:
-        told: set[bool] = set()
         for p in sorted(shown, key=lambda p: (p.a, p.b) in differing):
             differs = (p.a, p.b) in differing
-            label = None if differs in told else "pairs that differ" if differs else "pairs that agree"
-            told.add(differs)
+            label = "pairs that differ" if differs else "pairs that agree"
             drift = np.where(p.drift > 0, p.drift, np.nan)
             t = np.arange(len(drift)) * figure.period
             ax.plot(t, drift, color=WITHOUT if differs else GOOD, lw=1.6 if differs else 1.1, alpha=0.85, label=label)
         ax.set_yscale("log")
         ax.set(xlabel="time [s]", ylabel="difference [steps' motion]", xlim=(0, None))
-        figure_of(ax).legend(loc="outside upper center", ncols=2)
 
     caption = "Common starts, common random inputs: the largest difference of two runs, in units of what one step moves."
     return draw("drift", "How runs come apart", caption, on, link="drift")
@@ -92,8 +89,9 @@ def where_picture(key: str, p: PairFigure) -> Picture | None:
     def on(ax: Axes) -> None:
         heat(ax, p.axes, p.values / unit, top, f"difference of {p.state} [{label}]")
 
-    held = f" at {p.fixed}" if p.fixed else ""
-    caption = f"Where {p.a} and {p.b} differ in {p.state} after one step{held}, through the point where they differ most."
+    caption = (
+        f"Where {p.a} and {p.b} differ in {p.state} after one step{held(p.fixed)}, through the point where they differ most."
+    )
     return draw(f"where-{key}", f"{p.a} against {p.b}: where", caption, on, link=f"where {p.axes[0].name}, {p.axes[1].name}")
 
 

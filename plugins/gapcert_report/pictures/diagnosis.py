@@ -13,7 +13,7 @@ from gapcert.plugin import pretty
 from gapcert_figures import Channel, Correlation, Course, DiagnosisFigure, Law, Signal, Waterfall
 from gapcert_report.words.diagnosis import headline
 
-from .svg import BAD, FAINT, INK, TRUTH, WITH, WITHOUT, Picture, draw, figure_of, scaled
+from .svg import BAD, FAINT, INK, TRUTH, WITH, WITHOUT, Picture, draw, scaled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,7 +34,6 @@ def channel_picture(i: int, c: Channel) -> Picture:
         for values, colour, name in _simulated(c):
             ax.plot(c.t[::step], values[::step] / unit, color=colour, lw=1.3, label=name)
         ax.set(xlabel="time [s]", ylabel=f"{c.name} [{pretty(label)}]", ylim=(bottom / unit, top / unit))
-        figure_of(ax).legend(ncols=3, loc="outside upper center")
 
     when = " before and after the causes were added" if len(_simulated(c)) > 1 else ""
     caption = f"{c.name}: measured, and simulated from the same start{when}."
@@ -71,7 +70,6 @@ def error_picture(i: int, c: Channel) -> Picture:
             ax.plot(c.t[::step], (values - c.measured)[::step] / unit, color=colour, lw=1.2, label=name)
         ax.axhline(0, color=FAINT, lw=0.8)
         ax.set(xlabel="time [s]", ylabel=f"error of {c.name} [{pretty(label)}]")
-        figure_of(ax).legend(ncols=2, loc="outside upper center")
 
     when = ", before and after the causes were added" if len(_simulated(c)) > 1 else ""
     caption = f"{c.name}, simulated minus measured{when}."
@@ -95,7 +93,6 @@ def law_picture(i: int, law: Law) -> Picture:
             style = {"fmt": marker, "ms": 3.5, "color": TRUTH, "elinewidth": 1, "capsize": 2, "zorder": 3, "label": name}
             ax.errorbar(law.x[rows], law.y[rows] / unit, yerr=half, **style)
         ax.set(xlabel=pretty(law.x_label), ylabel=f"{what} [{pretty(label)}]")
-        figure_of(ax).legend(ncols=3, loc="outside upper center", handlelength=1.2, columnspacing=0.9)
 
     against = law.x_label.split(" [")[0]
     points = f"points: what the data ask for in each interval of {against}, no law assumed, with 95 % intervals"
@@ -156,19 +153,11 @@ def correlation_picture(i: int, c: Correlation) -> Picture:
         for values, colour, name in _simulated(c):
             ax.plot(c.lag[::step], values[::step], marker, ms=3, color=colour, lw=1.4, label=name)
         ax.set(xlabel="lag [s]", ylabel="correlation", ylim=(-1.05, 1.05))
-        figure_of(ax).legend(ncols=3, loc="outside upper center")
 
+    caption = f"At positive lags the residual follows {c.against}: an effect of the input that the model misses shows there."
     if c.against == "itself":
-        title, caption = (
-            f"Residual of {c.channel} with itself",
-            "White noise has none at any lag; the fit of free starts leaves a little.",
-        )
-    else:
-        title = f"Residual of {c.channel} with {c.against}"
-        caption = (
-            f"At positive lags the residual follows {c.against}: an effect of the input that the model misses shows there."
-        )
-    return draw(f"correlation{i}", title, caption, on, link="lag")
+        caption = "White noise has none at any lag; the fit of free starts leaves a little."
+    return draw(f"correlation{i}", f"Residual of {c.channel} with {c.against}", caption, on, link="lag")
 
 
 def course_picture(i: int, c: Course, many: bool) -> Picture:
@@ -183,7 +172,6 @@ def course_picture(i: int, c: Course, many: bool) -> Picture:
         if wide:
             ax.set_yscale("log")
         ax.set(xlabel="time [s]", ylabel="RMS residual [noise floors]")
-        figure_of(ax).legend(ncols=3, loc="outside upper center")
 
     title = "Residual over the recording" + (f", trajectory {i + 1}" if many else "")
     return draw(f"course{i}", title, "Each point is one fitted window: at 1, its residual is noise.", on, link="recording")
@@ -222,7 +210,6 @@ def gain_picture(summary: Mapping[str, Any]) -> Picture | None:
         shared = {units.get(c, "") for _, c, _ in rows}
         unit = pretty(shared.pop()) if len(shared) == 1 else "each in its unit"
         ax.set(xlabel="held-out error, RMSE" + (f" [{unit}]" if unit not in ("", "1") else ""), ylim=(-0.6, len(rows) - 0.1))
-        figure_of(ax).legend(loc="outside upper center", ncols=2)
 
     caption = "Error of the simulation on data that took no part, before and after; bars: 95 % bootstrap interval."
     return draw("gain", "What naming the causes bought", caption, on, 1.4 + 0.45 * len(rows))

@@ -8,6 +8,13 @@ CARD = "#fdfcfb"
 _VARIABLES = {
     INK: "ink", FAINT: "faint", WITH: "with", WITHOUT: "without", TRUTH: "truth", BAD: "bad", GOOD: "good", CARD: "card",
 }  # fmt: skip
+ROLES = {
+    "with γ": WITH, "without γ": WITHOUT, "measured": TRUTH, "before": WITHOUT, "after": WITH,
+    "stay": INK, "avoid": BAD, "target": GOOD, "region": GOOD,
+    # Inside bitmaps, so readable on light and dark alike.
+    "both": "#4a86dc", "only_with_gamma": "#23b5a8", "only_without_gamma": "#e8833a",
+}  # fmt: skip
+"""What figures name, in its colour."""
 
 
 def variables(text: str) -> str:

@@ -6,22 +6,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gapcert_figures import Axis, LoopFigure, WinningFigure
+from gapcert_figures import Axis, LoopFigure, WinningFigure, held
 
-from .svg import BAD, CARD, GOOD, INK, WITH, WITHOUT, Picture, classes, draw, figure_of, heat, name_axes
+from .svg import BAD, CARD, GOOD, INK, ROLES, Picture, classes, draw, heat, name_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.patches import Patch
 
-BOTH, ONLY_WITH, ONLY_WITHOUT = "#4a86dc", "#23b5a8", "#e8833a"  # inside bitmaps, so readable on light and dark alike
-_ROLES = {"stay": (INK, "to stay in"), "avoid": (BAD, "avoid"), "target": (GOOD, "target"), "region": (GOOD, "named region")}
+_TITLES = {"stay": "to stay in", "region": "named region"}
 PLANE = "plane"  # pictures with one cursor
 FIRST = 60  # steps of runs that lead nowhere
 _SIMILAR = 2.5  # ranges of one unit that differ by less are drawn to scale
-
-
-def rgba(colour: str, alpha: float = 1.0) -> tuple[float, ...]:
-    return (*(int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)), alpha)
 
 
 def _to_scale(axes: tuple[Axis, ...]) -> bool:
@@ -35,11 +31,11 @@ def plane_height(axes: tuple[Axis, ...]) -> float:
 
 def goal_parts(ax: Axes, w: WinningFigure, cut: bool) -> list[Any]:
     """The parts of the goal, as the plane cuts them or as shadows, and the legend's entries for them."""
-    from matplotlib.patches import Patch, Polygon
+    from matplotlib.patches import Polygon
 
     shown = [o for o in w.outlines if (o.cut if cut else o.where != "section")]
     for o in shown:
-        colour, line = _ROLES[o.role][0], ":" if o.dotted else "-"
+        colour, line = ROLES[o.role], ":" if o.dotted else "-"
         if o.role in ("target", "region") and not o.dotted:
             ax.add_patch(Polygon(o.points, fill=False, ec=CARD, lw=3.5, zorder=4))
         ax.add_patch(Polygon(o.points, fill=False, ec=colour, lw=1.5, ls=line, clip_on=False, zorder=4))
@@ -59,15 +55,20 @@ def goal_parts(ax: Axes, w: WinningFigure, cut: bool) -> list[Any]:
     )
     if _to_scale(w.axes):
         ax.set_aspect("equal")
-    roles = dict.fromkeys((o.role, o.dotted) for o in shown)
-    styles = [(*_ROLES[role], role, dotted) for role, dotted in roles]
-    return [
-        Patch(
-            fc=rgba(colour, 0.0) if dotted or role == "stay" else colour, ec=colour, ls=":" if dotted else "-",
-            alpha=None if dotted or role == "stay" else 0.55, label=f"{label}, elsewhere" if dotted else label,
+    return [_part(*part) for part in dict.fromkeys((o.role, o.dotted) for o in shown)]
+
+
+def _part(role: str, dotted: bool) -> Patch:
+    """A part of the goal in the legend."""
+    from matplotlib.colors import to_rgba
+    from matplotlib.patches import Patch
+
+    name, colour = _TITLES.get(role, role), ROLES[role]
+    if dotted or role == "stay":
+        return Patch(
+            fc=to_rgba(colour, 0.0), ec=colour, ls=":" if dotted else "-", label=f"{name}, elsewhere" if dotted else name
         )
-        for colour, label, role, dotted in styles
-    ]  # fmt: skip
+    return Patch(fc=colour, ec=colour, ls="-", alpha=0.55, label=name)
 
 
 def _dotted(w: WinningFigure, cut: bool) -> str:
@@ -78,19 +79,15 @@ def _dotted(w: WinningFigure, cut: bool) -> str:
 
 def winning_picture(w: WinningFigure) -> Picture:
     """Where each controller may start."""
-    a, b = w.with_gamma > 0, w.without_gamma > 0
-    first, second = w.labels
-    both = ((a & b, BOTH, "both win"), (a & ~b, ONLY_WITH, f"only {first}"), (b & ~a, ONLY_WITHOUT, f"only {second}"))
+    areas, (first, second) = w.areas, w.labels
 
-    def on(ax: Axes) -> None:
-        handles = classes(ax, w.axes, [(*part, 1.0) for part in both])
-        figure_of(ax).legend(
-            handles=[*handles, *goal_parts(ax, w, True)], loc="outside upper center", ncols=3, handlelength=1.2
-        )
+    def on(ax: Axes) -> list[Any]:
+        shown = classes(ax, w.axes, [(mask, ROLES[role], name, 1.0) for role, name, mask in areas])
+        return [*shown, *goal_parts(ax, w, True)]
 
-    held = f" at {w.fixed}" if w.fixed else ""
-    caption = f"Share of the set{held} from which the goal can be kept: {a.mean():.1%} {first}, {b.mean():.1%} {second}."
-    if (a & ~b).any() and first == "with γ":
+    shares = f"{w.with_gamma.mean():.1%} {first}, {w.without_gamma.mean():.1%} {second}"
+    caption = f"Share of the set{held(w.fixed)} from which the goal can be kept: {shares}."
+    if areas[1][2].any() and first == "with γ":
         caption += " The band [l, u] is signed: where the simulator errs to the safe side, knowing it wins states."
     caption = caption.replace("%", " %") + _dotted(w, True)
     return draw("winning", "Where the controller may start", caption, on, plane_height(w.axes), PLANE)
@@ -102,9 +99,9 @@ _NEXT = {"recurrence": "the target is met next", "automaton": "the automaton com
 def value_picture(w: WinningFigure) -> Picture:
     """What is promised of the time that the goal takes."""
 
-    def on(ax: Axes) -> None:
+    def on(ax: Axes) -> list[Any]:
         heat(ax, w.axes, w.values, float(np.nanmax(w.values)), "steps", "bottom")
-        figure_of(ax).legend(handles=goal_parts(ax, w, True), loc="outside upper center", ncols=3, handlelength=1.2)
+        return goal_parts(ax, w, True)
 
     where = f"{w.labels[0]}, at {w.fixed}" if w.fixed else w.labels[0]
     comes = _NEXT.get(w.goal, "the goal is reached")
@@ -117,15 +114,15 @@ def runs_picture(loop: LoopFigure, w: WinningFigure) -> Picture:
     leads = any(o.role in ("target", "region") for o in w.outlines)
     most = loop.runs[0].steps if leads else min(loop.runs[0].steps, FIRST)
 
-    def on(ax: Axes) -> None:
+    def on(ax: Axes) -> list[Any]:
         handles = goal_parts(ax, w, False)
         for runs in loop.runs:
-            colour, wide, alpha = (WITH, 1.1, 1.0) if runs.gamma else (WITHOUT, 4.0, 0.4)
-            label = "with γ" if runs.gamma else "without γ"
+            wide, alpha = (1.1, 1.0) if runs.gamma else (4.0, 0.4)
+            style: Any = {"color": ROLES[runs.name], "label": runs.name, "lw": wide, "alpha": alpha, "zorder": 5}
             for trace, end in zip(runs.traces, runs.ended, strict=True):
                 seen = trace[: most + 1]
                 for piece in loop.pieces(seen):
-                    (line,) = ax.plot(piece[:, 0], piece[:, 1], color=colour, label=label, lw=wide, alpha=alpha, zorder=5)
+                    (line,) = ax.plot(piece[:, 0], piece[:, 1], **style)
                 ax.plot(seen[0, 0], seen[0, 1], "o", mfc=CARD, mec=INK, ms=4.5, mew=1, zorder=7)
                 last = int(np.isfinite(trace).all(axis=1).sum()) - 1
                 if 0 <= end <= most:
@@ -133,7 +130,7 @@ def runs_picture(loop: LoopFigure, w: WinningFigure) -> Picture:
                 elif end < 0 and last < runs.steps:
                     ax.plot(*trace[last, :2], "o", color=GOOD, ms=5, zorder=8)
             handles.append(line)
-        figure_of(ax).legend(handles=handles, loc="outside upper center", ncols=3, handlelength=1.2)
+        return handles
 
     first = f"The first {most} steps of " if most < loop.runs[0].steps else ""
     over = f"{w.axes[0].name} and {w.axes[1].name}"

@@ -14,16 +14,16 @@ import numpy.typing as npt
 
 from gapcert.plugin import Array
 from gapcert_figures import Axis
-from gapcert_report.harvest import Entry, as_data, name_classes, read, take_legends
+from gapcert_report.harvest import Entry, as_data, legend_of, name_classes, read
 from gapcert_report.words.words import power
 
-from .palette import BAD, CARD, FAINT, GOOD, INK, TRUTH, WITH, WITHOUT, variables
+from .palette import BAD, CARD, FAINT, GOOD, INK, ROLES, TRUTH, WITH, WITHOUT, variables
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
-__all__ = ["BAD", "CARD", "FAINT", "GOOD", "INK", "TRUTH", "WITH", "WITHOUT", "Picture", "draw"]
+__all__ = ["BAD", "CARD", "FAINT", "GOOD", "INK", "ROLES", "TRUTH", "WITH", "WITHOUT", "Picture", "draw"]
+Paint = Callable[["Axes"], Sequence[Any] | None]
 WIDTH = 4.2  # inches
 _STYLE: Any = {
     "svg.fonttype": "none", "font.family": "sans-serif", "font.size": 9.5, "axes.titlesize": 9.5, "axes.labelsize": 9.5,
@@ -47,12 +47,10 @@ class Picture:
     data: Mapping[str, Any] | None = None
 
 
-def draw(
-    key: str, title: str, caption: str, paint: Callable[[Axes], None], height: float = WIDTH * 0.62, link: str = ""
-) -> Picture:
+def draw(key: str, title: str, caption: str, paint: Paint, height: float = WIDTH * 0.62, link: str = "") -> Picture:
     """Run `paint` on fresh axes and return the SVG; the same input gives the same bytes.
 
-    Pictures of one `link` share a cursor.
+    What `paint` returns is in the legend; where that is None, all that has a label. Pictures of one `link` share a cursor.
     """
     import matplotlib
     from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -63,9 +61,9 @@ def draw(
         figure = Figure(figsize=(WIDTH, height), layout="constrained", dpi=72)
         FigureCanvasSVG(figure)
         ax = figure.add_subplot()
-        paint(ax)
+        shown = paint(ax)
         _thin_out(ax)
-        legend = take_legends(figure, ax)
+        legend = legend_of(figure, ax.get_legend_handles_labels()[0] if shown is None else shown)
         series = read(ax)
         if (layout := figure.get_layout_engine()) is not None:
             layout.execute(figure)
@@ -114,31 +112,10 @@ def scaled(unit: str, *values: Array) -> tuple[float, str]:
     return 10.0**exponent, f"{power(exponent)} {unit}"
 
 
-def axis_label(axis: Axis) -> str:
-    """`theta [rad]`; the name alone where there is no unit."""
-    return axis.name if axis.unit in ("", "1") else f"{axis.name} [{axis.unit}]"
-
-
-def extent_of(axes: Sequence[Axis]) -> tuple[float, float, float, float]:
-    """(left, right, bottom, top) of the first two axes."""
-    return axes[0].low, axes[0].high, axes[1].low, axes[1].high
-
-
 def name_axes(ax: Axes, axes: Sequence[Axis]) -> None:
     """Labels and limits of the first two axes."""
-    ax.set(
-        xlabel=axis_label(axes[0]),
-        ylabel=axis_label(axes[1]),
-        xlim=(axes[0].low, axes[0].high),
-        ylim=(axes[1].low, axes[1].high),
-    )
-
-
-def figure_of(ax: Axes) -> Figure:
-    """The figure that axes are part of."""
-    figure = ax.get_figure(root=True)
-    assert figure is not None
-    return figure
+    x, y = axes[:2]
+    ax.set(xlabel=x.label, ylabel=y.label, xlim=(x.low, x.high), ylim=(y.low, y.high))
 
 
 def heat(ax: Axes, axes: Sequence[Axis], values: Array, top: float, label: str, bar: str = "right") -> None:
@@ -146,7 +123,7 @@ def heat(ax: Axes, axes: Sequence[Axis], values: Array, top: float, label: str, 
     image = ax.imshow(values, **_cells(axes), cmap="viridis", vmin=0, vmax=top)
     image.set_label(label)
     name_axes(ax, axes)
-    drawn = figure_of(ax).colorbar(image, ax=ax, label=label, location=bar, aspect=20 if bar == "right" else 40)
+    drawn = ax.figure.colorbar(image, ax=ax, label=label, location=bar, aspect=20 if bar == "right" else 40)
     drawn.outline.set_visible(False)
 
 
@@ -166,4 +143,5 @@ def classes(ax: Axes, axes: Sequence[Axis], parts: Sequence[tuple[npt.NDArray[np
 
 def _cells(axes: Sequence[Axis]) -> Any:
     # Not interpolated at all, an image has one pixel a cell: it is small, and stays exact however far one looks into it.
-    return {"extent": extent_of(axes), "origin": "lower", "aspect": "auto", "interpolation": "none"}
+    extent = (axes[0].low, axes[0].high, axes[1].low, axes[1].high)
+    return {"extent": extent, "origin": "lower", "aspect": "auto", "interpolation": "none"}
