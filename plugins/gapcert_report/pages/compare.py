@@ -11,7 +11,7 @@ from gapcert_report.pictures.svg import Picture
 from gapcert_report.words.compare import apart, groups, made, sentences, setting_name, share
 from gapcert_report.words.words import number
 
-from .html import Html, h, table
+from .html import Html, h, section, table
 
 Summary = Mapping[str, Any]
 OPEN = 3
@@ -50,30 +50,16 @@ def hero(summary: Summary, figures: Figures) -> list[Picture]:
 
 def differences(summary: Summary) -> Html | None:
     """All pairs as a table."""
-    rows = [_pair(p) for p in summary["pairs"]]
-    if not rows:
+    if not (rows := [_pair(p) for p in summary["pairs"]]):
         return None
-    head = (
-        "pair",
-        "agree",
-        "largest in",
-        "where",
-        "mean",
-        "largest",
-        "share of a step",
-        "bits differ from",
-        "beyond rounding from",
+    steps = "bits differ from", "beyond rounding from"
+    head = ("pair", "agree", "largest in", "where", "mean", "largest", "share of a step", *steps)
+    text = (
+        "Every pair was asked for one step from the same points, and for runs under the same random inputs. Two agree "
+        "where no more lies between them than the resolution of their arithmetic."
     )
-    return h(
-        "section",
-        h("h2", "Which simulators differ?"),
-        h(
-            "p",
-            "Every pair was asked for one step from the same points, and for runs under the same random inputs. Two agree "
-            "where no more lies between them than the resolution of their arithmetic.",
-        ),
-        table("After one step, in the unit of each state; the last columns are steps of a common run", head, rows, 4),
-    )
+    told = "After one step, in the unit of each state; the last columns are steps of a common run"
+    return section("Which simulators differ?", h("p", text), table(told, head, rows, 4))
 
 
 def _pair(p: Summary) -> tuple[object, ...]:
@@ -114,8 +100,6 @@ def causes(summary: Summary) -> Html | None:
         for p in apart(summary)
         for e in p["explained_by"]
     ]
-    if not rows:
-        return None
     head = ("pair", "change", "made in", "of the mean difference gone", "within resolution")
     return table("Changes that were made and measured again on the same points", head, rows, 3)
 
@@ -124,24 +108,15 @@ def matrix(summary: Summary) -> Html | None:
     """The certificates, one row each."""
     states = list(dict.fromkeys(s for r in summary["rows"] for s in r.get("states", {})))
     head = ("backend", "family", "Lipschitz", "claim", "seed", *(f"tightness of {s}" for s in states))
-    rows = [_row(r, states) for r in summary["rows"]]
-    if not rows:
+    if not (rows := [_row(r, states) for r in summary["rows"]]):
         return None
-    return h(
-        "section",
-        h("h2", "How wrong is the model against each?"),
-        h(
-            "p",
-            "Tightness is mean γ over mean gap: 1 is the gap itself. A gap below ten resolutions has none. "
-            "Samples are the transitions behind the bound and its constants.",
-        ),
-        table(
-            "One certificate per row; violations are of fresh points",
-            (*head, "samples", "CPU seconds", "violations"),
-            rows,
-            4,
-        ),
+    text = (
+        "Tightness is mean γ over mean gap: 1 is the gap itself. A gap below ten resolutions has none. "
+        "Samples are the transitions behind the bound and its constants."
     )
+    head = (*head, "samples", "CPU seconds", "violations")
+    shown = table("One certificate per row; violations are of fresh points", head, rows, 4)
+    return section("How wrong is the model against each?", h("p", text), shown)
 
 
 def _row(r: Summary, states: list[str]) -> tuple[object, ...]:
@@ -155,6 +130,4 @@ def _row(r: Summary, states: list[str]) -> tuple[object, ...]:
 def unavailable(summary: Summary) -> Html | None:
     """Simulators that this machine lacks."""
     rows = [(u["backend"], u["reason"]) for u in summary["unavailable"]]
-    if not rows:
-        return None
-    return h("section", h("h2", "Not available here"), table("Left out of the comparison", ("backend", "reason"), rows, 2))
+    return section("Not available here", table("Left out of the comparison", ("backend", "reason"), rows, 2))

@@ -18,8 +18,8 @@ from gapcert_report.words.diagnosis import (
     measured,
     numbers,
     plus_minus,
-    said,
     sentence,
+    setting_value,
     shrunk,
     smallest_named,
     whole,
@@ -29,7 +29,7 @@ from gapcert_report.words.diagnosis import (
 )
 from gapcert_report.words.words import number
 
-from .html import Html, gallery, h, join, listing, table
+from .html import Html, folded, gallery, h, join, listing, part, said, table
 
 Summary = Mapping[str, Any]
 
@@ -39,7 +39,7 @@ def tiles(summary: Summary) -> list[tuple[str, str, str, str]]:
     items = []
     for cause in summary.get("causes", ()):
         if setting := cause.get("setting"):
-            items.append(("", said(setting["value"]), "", cause_name(cause)))
+            items.append(("", setting_value(setting["value"]), "", cause_name(cause)))
             continue
         for name, p in cause["parameters"].items():
             unit = "" if p["unit"] == "1" else pretty(p["unit"])
@@ -68,12 +68,12 @@ def why_wrong(summary: Summary, album: DiagnosisAlbum, folder: Path, winning: Se
         return None
     parts = [
         h("h2", "Is it wrong?" if summary["verdict"] == "nothing" else "Why is it wrong?"),
-        h("p", sentence(summary)) if "certificate" in summary else None,  # else the page begins with it
+        said(sentence(summary) if "certificate" in summary else None),  # else the page begins with it
         _warned(summary),
         _causes(summary),
         _refitted(summary),
         gallery(album.laws),
-        _folded(f"Against the other quantities ({len(album.other_laws)})", album),
+        folded(f"Against the other quantities ({len(album.other_laws)})", gallery(album.other_laws)),
         _rivals(summary),
         _ambiguous(summary),
         _smallest(summary),
@@ -86,10 +86,6 @@ def why_wrong(summary: Summary, album: DiagnosisAlbum, folder: Path, winning: Se
         _extended(summary, folder),
     ]
     return h("section", *parts)
-
-
-def _folded(title: str, album: DiagnosisAlbum) -> Html | None:
-    return h("details", h("summary", title), gallery(album.other_laws)) if album.other_laws else None
 
 
 def _causes(summary: Summary) -> Html | None:
@@ -105,11 +101,11 @@ def _causes(summary: Summary) -> Html | None:
     named = "What part of the error goes with; none of it is shown to be the cause" if open_ else "Causes that were named"
     engine = ("engine's name",) if native else ()
     head = ("cause", *engine, "parameter", "value ± 95 % interval", "explains of the held-out error")
-    said: dict[str, list[str]] = {}
+    flagged: dict[str, list[str]] = {}
     for c in summary["causes"]:
         for flag in c.get("flags", ()):
-            said.setdefault(flag, []).append(cause_name(c))
-    flags = [h("p", h("b", f"{words.listed(names)}: "), flag) for flag, names in said.items()]
+            flagged.setdefault(flag, []).append(cause_name(c))
+    flags = [h("p", h("b", f"{words.listed(names)}: "), flag) for flag, names in flagged.items()]
     return join([table(f"{named}; each share with the other causes kept", head, rows, 3 + native), *flags])
 
 
@@ -119,7 +115,7 @@ def _refitted(summary: Summary) -> Html | None:
         for n, p in summary.get("refitted", {}).items()
     ]
     head = ("parameter", "stated", "fitted ± 95 % interval")
-    return table("Parameters that have a tolerance, fitted beside whatever was named", head, rows, 1) if rows else None
+    return table("Parameters that have a tolerance, fitted beside whatever was named", head, rows, 1)
 
 
 def _rivals(summary: Summary) -> Html | None:
@@ -130,21 +126,13 @@ def _rivals(summary: Summary) -> Html | None:
         if r:
             explains = f"{100 * r['explained']:.1f} %"
             rows.append((cause_name(c), cause_name(r), f"{100 * c['explained']:.1f} %", explains, number(r.get("margin"), 3)))
-    if not rows:
-        return None
     head = ("cause", "best rival in its place", "the cause explains", "the rival explains", "behind by (ΔS)")
     limits = (
         "A rival less than 10 behind could not be told apart; where one law contains the other, whose numbers are charged "
         "already, the limit is 4, or 9 where much of the residual is not noise."
     )
-    below = h("p", limits) if any(r[-1] != "–" for r in rows) else None
-    return join(
-        [
-            h("h3", "Rivals"),
-            table("The best of what was fitted in place of each cause", head, rows, 2),
-            below and h("p", below),
-        ]
-    )
+    below = h("p", h("p", limits)) if any(r[-1] != "–" for r in rows) else None
+    return part("Rivals", table("The best of what was fitted in place of each cause", head, rows, 2), below)
 
 
 def _of(summary: Summary) -> str:
@@ -169,32 +157,30 @@ def _ambiguous(summary: Summary) -> Html | None:
 
 
 def _smallest(summary: Summary) -> Html | None:
-    found = summary.get("smallest", ())
-    if not found:
+    if not (found := summary.get("smallest", ())):
         return None
     rows = [(cause_name(s), s["parameter"].replace("_", " "), measured(number(s["value"], 2), s["unit"])) for s in found]
     rest = table("The smallest of each effect that this recording would have shown", ("effect", "parameter", "from"), rows, 2)
     text = f"Had it been there, it would have been seen: {briefly(smallest_named(summary), 4)}."
-    return join([h("h3", "What would have been seen"), h("p", text), h("details", h("summary", f"All {len(rows)}"), rest)])
+    return part("What would have been seen", h("p", text), folded(f"All {len(rows)}", rest))
 
 
 def _experiment(summary: Summary, album: DiagnosisAlbum, folder: Path) -> Html | None:
-    design = summary.get("design")
-    if not design:
-        return h("p", f"An experiment that would tell more: {summary['experiment']}") if summary.get("experiment") else None
+    if not (design := summary.get("design")):
+        return said(summary.get("experiment") and f"An experiment that would tell more: {summary['experiment']}")
     pair = [cause_name(r) for r in design["rivals"]]
     rows = [(design["name"], number(design["separation"], 3))]
     rows += [(n, number(v, 3)) for n, v in sorted(design["others"].items(), key=lambda x: -x[1])]
     file = Path(summary["experiment_file"]).name if summary.get("experiment_file") else None
-    return join([
-        h("h3", "The experiment that decides"),
+    return part(
+        "The experiment that decides",
         h("p", f"Between {words.listed(pair)}. {experiment_sentence(design)}"),
         h("p", "The signal is in ", h("code", file), " in the folder of this run. Record the answer, add the log to ",
           h("code", "recording.files"), " and diagnose both together.") if file else None,
         gallery(album.experiment),
         table("How far one rival's prediction stays from the best copy by the other, in noise floors (RMS)",
               ("input", "apart"), rows),
-    ])  # fmt: skip
+    )  # fmt: skip
 
 
 def _gain(summary: Summary, album: DiagnosisAlbum) -> Html | None:
@@ -213,7 +199,7 @@ def _gain(summary: Summary, album: DiagnosisAlbum) -> Html | None:
         ("channel, horizon", "before" if named else "error", *after, "unit"),
         rows,
     )
-    return join([h("h3", "On data that took no part"), gallery(album.motions), shown])
+    return part("On data that took no part", gallery(album.motions), shown)
 
 
 def _left(summary: Summary, album: DiagnosisAlbum) -> Html | None:
@@ -224,14 +210,14 @@ def _left(summary: Summary, album: DiagnosisAlbum) -> Html | None:
     tests = summary.get("evidence", {})
     names = list(dict.fromkeys(c for one in tests.values() for c in one))
     found = [(test, _unit_of(test), *(number(one.get(c), 3) for c in names)) for test, one in tests.items()]
+    rms = "RMS residual of the fitted windows beside the noise floor, in the channel's unit"
+    told = "Tests of what is left; of noise alone, none is beyond 3 standard deviations"
     return join([
         h("h3", "What is left"),
         _unexplained(summary.get("unexplained")),
-        table("RMS residual of the fitted windows beside the noise floor, in the channel's unit",
-              ("channel", *columns.values()), rows) if rows else None,
+        table(rms, ("channel", *columns.values()), rows),
         gallery(album.left),
-        table("Tests of what is left; of noise alone, none is beyond 3 standard deviations", ("test", "in", *names), found, 2)
-        if found else None,
+        table(told, ("test", "in", *names), found, 2),
     ])  # fmt: skip
 
 
@@ -260,31 +246,28 @@ def _unexplained(rest: Summary | None) -> Html | None:
     if law := rest.get("correction"):
         terms = [(term, number(v)) for term, v in law["terms"].items()]
         known = f"it predicts {100 * law['explained']:.0f} % of the residual in data not seen"
-        parts.append(
-            table(f"A correction from data alone at {law['site']}, not a cause; {known}", ("term", "coefficient"), terms)
-        )
+        caption = f"A correction from data alone at {law['site']}, not a cause; {known}"
+        parts.append(table(caption, ("term", "coefficient"), terms))
     return join(parts)
 
 
-def _warned(summary: Summary) -> Html | None:
-    said = summary.get("warnings", ())
-    return join([h("p", f"Warning: {w}.", class_="bad") for w in said]) if said else None
+def _warned(summary: Summary) -> Html:
+    return join([h("p", f"Warning: {w}.", class_="bad") for w in summary.get("warnings", ())])
 
 
 def _assumed(summary: Summary) -> Html | None:
-    said = summary.get("assumptions")
-    return h("p", h("b", "Assumed: "), "; ".join(said), ".") if said else None
+    assumed = summary.get("assumptions")
+    return h("p", h("b", "Assumed: "), "; ".join(assumed), ".") if assumed else None
 
 
 def _log(summary: Summary) -> Html | None:
-    log = summary.get("log")
-    if not log:
+    if not (log := summary.get("log")):
         return None
     rows = [(str(k).replace("_", " "), _told(v)) for k, v in log.items()]
     found = "; ".join(repairs(log))
     return join([
         h("p", h("b", "Repaired in the recording: "), found, ".") if found else None,
-        h("details", h("summary", "What was found in the recording"), table("Recording", ("what", "found"), rows, 2)),
+        folded("What was found in the recording", table("Recording", ("what", "found"), rows, 2)),
     ])  # fmt: skip
 
 
@@ -297,24 +280,18 @@ def _told(value: Any) -> str:
 
 
 def _recertified(summary: Summary, winning: Sequence[Picture]) -> Html | None:
-    again = summary.get("recertified")
-    if not again:
+    if not (again := summary.get("recertified")):
         return None
     rows = [(name, number(old), number(new), f"{number(old / new, 3)} ×") for name, old, new in shrunk(summary)]
     head = ("state", "mean γ before", "mean γ after", "smaller by")
-    said = [
+    claims = [
         h("p", f"{when}: ", c["refused"] if "refused" in c else words.claim_sentence(c))
         for when, c in (("Without the causes", again.get("before")), ("With them", again.get("after")))
         if c
     ]
-    return join([
-        h("h3", "How wrong it was, and is"),
-        table("The certificate, before and after the causes were added to the model", head, rows) if rows else None,
-        *said,
-        gallery(winning),
-        _controllers(again),
-        h("p", text) if (text := won_sentence(summary)) else None,
-    ])  # fmt: skip
+    shown = table("The certificate, before and after the causes were added to the model", head, rows)
+    last = gallery(winning), _controllers(again), said(won_sentence(summary))
+    return part("How wrong it was, and is", shown, *claims, *last)
 
 
 def _controllers(again: Summary) -> Html | None:
@@ -335,10 +312,10 @@ def _extended(summary: Summary, folder: Path) -> Html | None:
     file = folder / Path(path).name
     text = file.read_text(encoding="utf-8") if file.is_file() else None
     equations = summary.get("equations")
-    return join([
-        h("h3", "The extended model"),
+    return part(
+        "The extended model",
         listing(equations, "The equations of the extended model") if equations else None,
         h("p", "Saved as ", h("code", file.name), " in the folder of this run; ", h("code", f"gapcert extend {folder.name}"),
           " writes it elsewhere."),
-        h("details", h("summary", "As a spec"), listing(text, "The extended model as a spec")) if text else None,
-    ])  # fmt: skip
+        folded("As a spec", listing(text, "The extended model as a spec") if text else None),
+    )  # fmt: skip

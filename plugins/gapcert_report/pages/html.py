@@ -37,8 +37,31 @@ def join(children: Iterable[object]) -> Html:
     return Html("".join(c if isinstance(c, Html) else escape(str(c)) for c in children if c is not None))
 
 
-def table(caption: str, head: Sequence[object], rows: Iterable[Sequence[object]], text_columns: int = 1) -> Html:
-    """A table that scrolls inside its own box on narrow screens; the first columns are text, the rest numbers."""
+def section(title: str, *parts: object) -> Html | None:
+    """A section of a page; None where there is nothing in it."""
+    return h("section", h("h2", title), *parts) if any(p is not None for p in parts) else None
+
+
+def part(title: str, *parts: object) -> Html | None:
+    """A part of a section, likewise."""
+    return join([h("h3", title), *parts]) if any(p is not None for p in parts) else None
+
+
+def folded(title: str, *parts: object) -> Html | None:
+    """What is seen when its title is pressed, likewise."""
+    return h("details", h("summary", title), *parts) if any(p is not None for p in parts) else None
+
+
+def said(text: str | None, **attributes: str) -> Html | None:
+    """A paragraph; None for no text."""
+    return h("p", text, **attributes) if text else None
+
+
+def table(caption: str, head: Sequence[object], rows: Iterable[Sequence[object]], text_columns: int = 1) -> Html | None:
+    """A table that scrolls inside its own box on narrow screens; the first columns are text, the rest numbers.
+
+    None where there are no rows.
+    """
 
     def cell(i: int, value: object) -> Html:
         if i == 0:
@@ -46,6 +69,8 @@ def table(caption: str, head: Sequence[object], rows: Iterable[Sequence[object]]
         return h("td", value) if i < text_columns else h("td", value, class_="n")
 
     body = [h("tr", *(cell(i, v) for i, v in enumerate(row))) for row in rows]
+    if not body:
+        return None
     top = [h("th", v, scope="col", class_="n" if i >= text_columns else "t") for i, v in enumerate(head)]
     inner = h("table", h("caption", caption), h("thead", h("tr", *top)), h("tbody", *body))
     return h("div", inner, class_="scroll", tabindex="0", role="region", aria_label=caption)

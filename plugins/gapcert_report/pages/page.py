@@ -18,7 +18,7 @@ from gapcert_report.words.diagnosis import cause_name, sentence, whole
 from gapcert_report.words.words import number
 
 from . import compare, diagnosis
-from .html import Html, document, framed, gallery, h, join, listing, table
+from .html import Html, document, folded, framed, gallery, h, join, listing, part, said, section, table
 
 Summary = Mapping[str, Any]
 _MARKS = {"good": "✓", "bad": "✗", "open": "?"}
@@ -58,8 +58,8 @@ def answer(summary: Summary) -> Html:
     if "certificate" in summary:
         c = summary["certificate"]
         refuted = words.refutation(c) is not None
-        said = (words.claim_sentence(c), "" if refuted else words.tightness_sentence(c), words.loop_sentence(summary))
-        parts += [h("p", s) for s in said if s]
+        told = (words.claim_sentence(c), "" if refuted else words.tightness_sentence(c), words.loop_sentence(summary))
+        parts += [h("p", s) for s in told if s]
     elif "causes" in summary:
         parts.append(h("p", whole(sentence(summary))))
     elif "pairs" in summary:
@@ -67,8 +67,8 @@ def answer(summary: Summary) -> Html:
     if summary["verdict"] in ("fails", "unknown") or len(parts) == 1:
         parts.append(h("p", summary.get("reason") or meaning))
     if unmet := [e for e in summary.get("expectations", ()) if not e["met"]]:
-        told = words.some([f"{e['text']} (found {_value(e['value'])})" for e in unmet], 3)
-        parts.append(h("p", h("b", f"{_MARKS['bad']} Not as the spec expects", class_="bad"), f": {told}."))
+        which = words.some([f"{e['text']} (found {_value(e['value'])})" for e in unmet], 3)
+        parts.append(h("p", h("b", f"{_MARKS['bad']} Not as the spec expects", class_="bad"), f": {which}."))
     if "certificate" in summary:
         parts.append(h("p", words.symbols(summary["certificate"]), class_="symbols"))
     return h("section", *parts, class_=f"answer {kind}", aria_label="Answer")
@@ -109,11 +109,11 @@ def expectations(summary: Summary) -> Html | None:
         return None
     rows = [(e["text"], _value(e["value"]), mark(e["met"])) for e in found]
     met = sum(bool(e["met"]) for e in found)
-    all_met = met == len(rows)
-    said = f"{_MARKS['good' if all_met else 'bad']} {met} of {len(rows)} that the spec states are met"
     shown = table("What the spec expects, and what was found", ("expected", "found", "met"), rows, 3)
-    folded = h("details", h("summary", said), shown) if all_met else join([h("p", f"{said}.", class_="bad"), shown])
-    return h("section", h("h2", "Expectations"), folded)
+    told = f"{_MARKS['good' if met == len(rows) else 'bad']} {met} of {len(rows)} that the spec states are met"
+    if met == len(rows):
+        return section("Expectations", folded(told, shown))
+    return section("Expectations", h("p", f"{told}.", class_="bad"), shown)
 
 
 def _value(value: Any) -> str:
@@ -152,7 +152,7 @@ def beside(summary: Summary) -> Html | None:
         )
         for r in rows
     ]
-    return h("section", h("h2", "The same question by another route"), table("Sampling included", columns, cells))
+    return section("The same question by another route", table("Sampling included", columns, cells))
 
 
 def how_wrong(summary: Summary, figures: Figures, album: Album) -> Html | None:
@@ -175,40 +175,31 @@ def how_wrong(summary: Summary, figures: Figures, album: Album) -> Html | None:
     over = ", over the transitions of the held windows" if measured else ", over the audit's points" if asked else ""
     # Warnings stand above the list already.
     rests = [words.plain(a) for a in c["assumptions"] if not a.startswith("Warning: ")]
-    return h(
-        "section",
-        h("h2", "How wrong can the model be?"),
+    return section(
+        "How wrong can the model be?",
         table(f"Per state{over}; γ in the unit of the state, per step", ("state", *columns.values()), rows),
         gallery(album.pairs, "pictures pairs"),
         gallery(album.bands),
-        h("details", h("summary", f"Along the other axes ({len(album.other_axes)})"), gallery(album.other_axes))
-        if album.other_axes
-        else None,
+        folded(f"Along the other axes ({len(album.other_axes)})", gallery(album.other_axes)),
         h("h3", "What the claim rests on"),
         h("p", words.claim_sentence(c)),
         *(h("p", f"Warning: {w.rstrip('.')}.", class_="bad") for w in c.get("warnings", ())),
-        h("p", said) if (said := words.jump_sentence(c)) else None,
+        said(words.jump_sentence(c)),
         h("ol", *(h("li", a) for a in rests)) if rests else h("p", "No assumption is recorded."),
         _hidden(c),
         _spent(c) if asked else None,
     )
 
 
-def _spent(c: Summary) -> Html:
+def _spent(c: Summary) -> Html | None:
     """Transitions by their purpose, and what attacked the band, or set it."""
     spent = {"bound": "for the bound itself", "lipschitz": "to estimate constants", "audit": "for the audit"}
     spent |= {"calibration": "to set the band", "symmetry": "to check the symmetry"}
     samples = [(spent.get(k, k), number(v)) for k, v in c["samples"].items()]
     measured = "recording" in c
-    return join([
-        h("h3", "What was measured, and what set the band" if measured else "What was spent, and what attacked it"),
-        h(
-            "div",
-            table("Measured transitions" if measured else "Simulator transitions", ("purpose", "transitions"), samples),
-            _windows(c["recording"]) if measured else _audit(c),
-            class_="side",
-        ),
-    ])  # fmt: skip
+    title = "What was measured, and what set the band" if measured else "What was spent, and what attacked it"
+    shown = table("Measured transitions" if measured else "Simulator transitions", ("purpose", "transitions"), samples)
+    return part(title, h("div", shown, _windows(c["recording"]) if measured else _audit(c), class_="side"))
 
 
 def _hidden(c: Summary) -> Html | None:
@@ -222,14 +213,11 @@ def _hidden(c: Summary) -> Html | None:
     if (bound := hidden.get("bound")) is not None:
         allowed = f"γ allows for: the most between two draws, times {hidden['safety']:g}"
         rows.append((allowed, *(number(2 * bound[n], 3) for n in states)))
-    return join([
-        h("h3", "What the model leaves out"),
-        h("p", words.hidden_sentence(hidden)),
-        table("How far it moves the next state, in the unit of each", ("hidden state", *states), rows) if rows else None,
-    ])  # fmt: skip
+    shown = table("How far it moves the next state, in the unit of each", ("hidden state", *states), rows)
+    return part("What the model leaves out", h("p", words.hidden_sentence(hidden)), shown)
 
 
-def _windows(made: Summary) -> Html:
+def _windows(made: Summary) -> Html | None:
     windows, rows = made["windows"], made["rows"]
     counts = [
         ("windows of the fit", windows["fit"]),
@@ -246,18 +234,17 @@ def _audit(c: Summary) -> Html:
     names = {"points": "points", "violations": "outside [l, u]", "gamma_violations": "above γ", "epsilon": "ε", "beta": "β"}
     rows = [(t, *(number(c[t].get(k)) for k in names)) for t in ("audit", "attack") if t in c]
     inner = table("On points that no fit has seen", ("test", *names.values()), rows)
-    return h("div", inner, h("p", said) if (said := words.witness_sentence(c)) else None)
+    return h("div", inner, said(words.witness_sentence(c)))
 
 
 def compared(summary: Summary, figures: Figures) -> Html | None:
     """Simulator against simulator, and the matrix of certificates."""
     if "pairs" not in summary:
         return None
-    seen, folded = compare.gallery_of(summary, figures)
-    more = h("details", h("summary", f"The other pairs ({len(folded)} pictures)"), gallery(folded, "pictures pairs"))
-    parts = [gallery(seen, "pictures pairs"), more if folded else None, compare.causes(summary)]
-    found = [compare.differences(summary), *parts, compare.matrix(summary), compare.unavailable(summary)]
-    return join(p for p in found if p is not None)
+    seen, others = compare.gallery_of(summary, figures)
+    more = folded(f"The other pairs ({len(others)} pictures)", gallery(others, "pictures pairs"))
+    parts = [compare.differences(summary), gallery(seen, "pictures pairs"), more, compare.causes(summary)]
+    return join([*parts, compare.matrix(summary), compare.unavailable(summary)])
 
 
 def controller(summary: Summary, album: Album) -> Html | None:
@@ -265,7 +252,7 @@ def controller(summary: Summary, album: Album) -> Html | None:
     c, loop = summary.get("controller"), summary.get("closed_loop")
     if not (c or loop):
         return None
-    parts: list[Html | None] = [h("h2", "What does it buy a controller?"), gallery(album.loop)]
+    parts: list[Html | None] = [gallery(album.loop)]
     if loop:
         rows = loop.get("policies") or [{**loop[k], "controller": k} for k in ("without_gamma", "with_gamma") if k in loop]
         parts.append(_policies(rows))
@@ -277,14 +264,12 @@ def controller(summary: Summary, album: Album) -> Html | None:
             for r in rows
             if r["controller"] == "with_gamma" and (n := words.on_the_way(r))
         ]
-        parts.append(
-            h("p", f"With γ, still on the way to the target after the last step: {words.listed(late)}.") if late else None
-        )
+        parts.append(said(f"With γ, still on the way to the target after the last step: {words.listed(late)}." if late else ""))
         parts += [h("p", broken_sentence(r), ".") for r in rows if r["controller"] == "with_gamma" and r.get("broken_promises")]
         if skipped := loop.get("skipped"):
             told = words.listed(skipped).replace("gamma", "γ")
             parts.append(h("p", f"Asked for, and not run since these controllers do not know them: {told}."))
-        parts += [h("p", said) for said in (words.learned_sentence(loop), words.runs_sentence(loop)) if said]
+        parts += [said(words.learned_sentence(loop)), said(words.runs_sentence(loop))]
     if c:
         hidden = ("levels", "gap_over_cells", "assumptions")
         rows = [(_QUANTITIES.get(k, k.replace("_", " ")), _short(v)) for k, v in c.items() if k not in hidden]
@@ -293,10 +278,10 @@ def controller(summary: Summary, album: Album) -> Html | None:
             parts += [h("h3", "What the controller takes on trust"), h("ol", *(h("li", words.plain(a)) for a in trusted))]
         parts.append(_levels(c["levels"]) if c.get("levels") else None)
         parts.append(h("p", words.suprema(told)) if (told := c.get("gap_over_cells")) else None)
-    return h("section", *parts)
+    return h("section", h("h2", "What does it buy a controller?"), *parts)
 
 
-def _levels(levels: Sequence[Summary]) -> Html:
+def _levels(levels: Sequence[Summary]) -> Html | None:
     """The winning part of the volume against the size of the smallest cells, and what a uniform grid of these would count."""
     shown, made = list[tuple[object, ...]](), 0
     for row in levels:
@@ -308,7 +293,7 @@ def _levels(levels: Sequence[Summary]) -> Html:
     return table("Domain against cell size", head, shown)
 
 
-def _policies(counts: Sequence[Summary]) -> Html:
+def _policies(counts: Sequence[Summary]) -> Html | None:
     order = list(dict.fromkeys(r["policy"] for r in counts))
     columns = {"violations": "violations", "stranded": "stranded", "left_goal": "left the goal"}
     if any("reached" in r for r in counts):
@@ -338,36 +323,28 @@ def _kept(row: Summary) -> Html:
     return mark(False if row["violations"] else None if words.on_the_way(row) else True)
 
 
-def provenance(summary: Summary, figures: Figures, folder: Path) -> Html:
+def provenance(summary: Summary, figures: Figures, folder: Path) -> Html | None:
     """Stages, timings, versions, and the commands that look at this run again."""
     times = {k.replace("_", " "): number(v) for k, v in _flat(summary.get("timings", {}))}
     versions = sorted(_versions(folder).items())
     lanes = {lane.stage.replace("_", " "): lane.states[-1] for lane in figures.lanes}
     stages = [(name, lanes.get(name, ""), times.get(name, "")) for name in dict.fromkeys([*lanes, *times])]
-    name = folder.name
-    commands = f"gapcert report {name}  # write this page again\n"
     certified = [p for p in (folder, folder / "before", folder / "after") if (p / "certificate.json").exists()]
-    checks = [
+    verify = (
         f"gapcert verify {p.relative_to(folder.parent)}  # check the certificate again, from its data\n" for p in certified
-    ]
-    commands = "".join(checks) + commands
+    )
+    commands = "".join([*verify, f"gapcert report {folder.name}  # write this page again\n"])
     if (folder / "run.rrd").exists():
-        commands += f"rerun --bind 127.0.0.1 {name}/run.rrd  # walk through the run in the Rerun viewer\n"
-    return h(
-        "section",
-        h("h2", "How this was made"),
+        commands += f"rerun --bind 127.0.0.1 {folder.name}/run.rrd  # walk through the run in the Rerun viewer\n"
+    tables = (
+        table("Stages", ("stage", "ended with", "seconds"), stages, 2),
+        table("Versions", ("package", "version"), versions, 2),
+    )
+    return section(
+        "How this was made",
         h("p", "From the folder above the run:"),
         listing(commands, "Commands"),
-        h(
-            "details",
-            h("summary", "Stages, time and versions"),
-            h(
-                "div",
-                table("Stages", ("stage", "ended with", "seconds"), stages, 2) if stages else None,
-                table("Versions", ("package", "version"), versions, 2) if versions else None,
-                class_="side",
-            ),
-        ),
+        folded("Stages, time and versions", h("div", *tables, class_="side")),
     )
 
 

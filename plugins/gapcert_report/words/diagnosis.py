@@ -66,14 +66,14 @@ def amount(cause: Summary) -> str:
 def numbers(cause: Summary) -> Iterator[tuple[str, str]]:
     """(name, value with its interval and unit) of everything about a cause; of a setting its value and what it was."""
     if setting := cause.get("setting"):
-        yield "value", f"{said(setting['value'])} instead of {said(setting['was'])}"
+        yield "value", f"{setting_value(setting['value'])} instead of {setting_value(setting['was'])}"
         return
     for name, p in cause["parameters"].items():
         yield name.replace("_", " "), measured(plus_minus(p["value"], p["low"], p["high"]), p["unit"])
 
 
-def said(value: Any) -> str:
-    """The value of a setting."""
+def setting_value(value: Any) -> str:
+    """Of an engine, in words."""
     if value is None:
         return "what the file says"
     return number(value) if isinstance(value, int | float) and not isinstance(value, bool) else str(value).lower()
