@@ -11,7 +11,6 @@ from gapcert.plugin import Emit, Event, Pulse
 from gapcert_figures import (
     Figures,
     Lane,
-    Playback,
     channel_playback,
     drawn,
     gap_figure,
@@ -47,12 +46,7 @@ class Illustrator:
         if event.name == "stage-finished":
             kept = ("model", "with_gamma", "without_gamma")
             self._context |= {k: v for k, v in data.items() if k in kept}
-            try:
-                figure = self._draw(event.stage, data)
-            except Exception as error:  # whatever a picture stumbles on, the run goes on without it
-                message = f"no picture of {event.stage}: {type(error).__name__}: {error}"
-                self(Event("warning", event.stage, {"message": message}))
-                figure = None
+            figure = self._tried("picture", event.stage, lambda: self._draw(event.stage, data))
             if figure is not None:
                 data["figure"] = figure
             if event.stage == "certificate":
@@ -64,55 +58,51 @@ class Illustrator:
         return self.emit(Event(event.name, event.stage, data))
 
     def _draw(self, stage: str, data: Mapping[str, Any]) -> Any:
-        if stage == "certificate":
-            if "recording" in data:
-                self.figures = replace(self.figures, recorded=recorded_figure(data["certificate"]))
-                return self.figures.recorded
-            if "backend" not in data:  # γ is declared, and there is nothing beside it to draw
-                return None
+        """The figure of a stage, which is kept among the others; None where there is none."""
+        drawn = self._drawn(stage, data)
+        self.figures = replace(self.figures, **drawn)
+        return next(iter(drawn.values()), None)
+
+    def _drawn(self, stage: str, data: Mapping[str, Any]) -> dict[str, Any]:
+        if stage == "certificate" and "recording" in data:
+            return {"recorded": recorded_figure(data["certificate"])}
+        if stage == "certificate" and "backend" in data:  # else γ is declared, and there is nothing beside it to draw
             from gapcert.plugin import Residual
 
-            gap = gap_figure(data["certificate"], Residual(data["backend"], data["model"]), data["domain"])
-            self.figures = replace(self.figures, gap=gap)
-            return gap
+            return {"gap": gap_figure(data["certificate"], Residual(data["backend"], data["model"]), data["domain"])}
         if stage == "controller" and data.get("without_gamma") is not None:
-            winning = winning_figure(data["with_gamma"], data["without_gamma"], tell=self._tell)
-            self.figures = replace(self.figures, winning=winning)
-            return winning
+            return {"winning": winning_figure(data["with_gamma"], data["without_gamma"], tell=self._tell)}
         if stage == "recertified" and len(data["controllers"]) == 2:
             both, labels = data["controllers"], ("with the causes", "without the causes")
-            winning = winning_figure(both["after"], both["before"], labels, self._tell)
-            self.figures = replace(self.figures, winning=winning)
-            return self.figures.winning
+            return {"winning": winning_figure(both["after"], both["before"], labels, self._tell)}
         if stage == "closed_loop":
             context = (self._context[k] for k in ("model", "with_gamma", "without_gamma"))
             loop, played = loop_figure(data["closed_loop"], *context), data["closed_loop"]
             first, body = int(drawn(played)[0]), data.get("backend")
             if body is not None:
-                loop = replace(loop, playback=self._played(stage, lambda: loop_playback(played, body, first)))
-            self.figures = replace(self.figures, loop=loop)
-            return loop
+                moving = self._tried("playback", stage, lambda: loop_playback(played, body, first))
+                loop = replace(loop, playback=moving)
+            return {"loop": loop}
         if stage == "pairs" and data["comparison"].figure.pairs:
-            self.figures = replace(self.figures, compare=data["comparison"].figure)
-            return self.figures.compare
+            return {"compare": data["comparison"].figure}
         if stage == "diagnosis" and data["diagnosis"].figure is not None and data["diagnosis"].figure is not self._diagnosed:
             found = self._diagnosed = data["diagnosis"].figure
             if found.playback is None:
-                played = self._played(stage, lambda: channel_playback(found.channels, data.get("bodies", ())))
-                found = replace(found, playback=played)
-            self.figures = replace(self.figures, diagnosis=found)
-            return found
-        return None
+                bodies = data.get("bodies", ())
+                moving = self._tried("playback", stage, lambda: channel_playback(found.channels, bodies))
+                found = replace(found, playback=moving)
+            return {"diagnosis": found}
+        return {}
 
     def _tell(self, done: int, total: int) -> None:
         self._pulse(done, text="winning domain", total=total)
 
-    def _played(self, stage: str, play: Callable[[], Playback | None]) -> Playback | None:
-        """Playback of a robot; the other pictures of the stage do not depend on it."""
+    def _tried(self, what: str, stage: str, make: Callable[[], Any]) -> Any:
+        """What a stage has to show; whatever that stumbles on, the run goes on without it."""
         try:
-            return play()
-        except Exception as error:  # whatever an engine stumbles on
-            self(Event("warning", stage, {"message": f"no playback of {stage}: {type(error).__name__}: {error}"}))
+            return make()
+        except Exception as error:  # of an engine, a solver, a plugin
+            self(Event("warning", stage, {"message": f"no {what} of {stage}: {type(error).__name__}: {error}"}))
             return None
 
     def _lane(self, event: Event) -> dict[str, Any]:

@@ -1,28 +1,24 @@
-"""Results as a notebook shows them: the verdict and the sentence of its claim, a small table, a picture or two; and in a line.
+"""How results are shown: in a line, in a sentence, on a terminal, and in a notebook. The components of kind `view`.
 
-Words, tables and pictures are those of the report, so that no more is said here than there. Colours are such as can be read on
-white and on black, and text has that of its surroundings: no script has to ask which theme is on.
+A notebook shows the verdict and the sentence of its claim, a small table, a picture or two. Words, tables and pictures are
+the report's, so that no more is said here than there. Colours are such as can be read on white and on black, and text has
+that of its surroundings: no script has to ask which theme is on.
 """
 
 from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, final
 
-from gapcert.plugin import times
+from gapcert.plugin import View, times
 
 from .pages.html import Html, h, join, legend, table
 from .words import words
 from .words.words import number
 
 if TYPE_CHECKING:
-    from gapcert_calibrate import CalibratedRecording
-    from gapcert_compare import Comparison
-    from gapcert_diagnosis import Diagnosis
-
     from .pictures.svg import Picture
 
 Summary = Mapping[str, Any]
@@ -80,13 +76,10 @@ def certificate_html(c: Summary, pictures: Sequence[Picture] = ()) -> str:
 
 
 def _certified(c: Summary) -> tuple[list[object], str]:
-    refuted = words.refutation(c) is not None
-    assumed = c["claim"]["kind"] == "assumed"
-    word, kind = (
-        ("Refuted", "bad") if refuted else ("Assumed", "open") if assumed else (c["claim"]["kind"].capitalize(), "good")
-    )
-    if kind == "good" and c["claim"]["kind"] == "empirical":
-        kind = "open"
+    claim = c["claim"]["kind"]
+    word, kind = claim.capitalize(), "open" if claim in ("assumed", "empirical") else "good"
+    if words.refutation(c) is not None:
+        word, kind = "Refuted", "bad"
     said = [words.claim_sentence(c), words.tightness_sentence(c)]
     warned = [h("p", f"Warning: {w.rstrip('.')}.") for w in c.get("warnings", ())]
     return [_verdict(word, kind), *(h("p", s) for s in said if s), *warned], kind
@@ -118,14 +111,6 @@ def _short(caption: str, head: Sequence[object], rows: Sequence[Sequence[object]
     return join([table(caption, head, rows[:ROWS], texts), more])
 
 
-def diagnosis_html(d: Diagnosis) -> str:
-    """What was found, its numbers, and the pictures that carry the answer."""
-    from .pictures.diagnosis import diagnosis_album
-
-    summary = d.summary()
-    return shown(*_diagnosed(summary), _causes(summary), pictures=diagnosis_album(d.figure, summary).hero)
-
-
 def _diagnosed(summary: Summary) -> tuple[list[object], str]:
     from .words.diagnosis import sentence
 
@@ -133,21 +118,12 @@ def _diagnosed(summary: Summary) -> tuple[list[object], str]:
     return [_verdict(word, kind), h("p", sentence(summary))], kind
 
 
-def _causes(summary: Summary) -> Html | None:
-    from .words.diagnosis import cause_name, numbers
+def _causes(summary: Summary) -> Html:
+    from .words.diagnosis import cause_name, explained, numbers
 
-    rows = [(cause_name(c), n, v, f"{100 * c['explained']:.1f} %") for c in summary["causes"] for n, v in numbers(c)]
+    rows = [(cause_name(c), n, v, explained(c)) for c in summary["causes"] for n, v in numbers(c)]
     head = ("cause", "parameter", "value ± 95 % interval", "explains of the held-out error")
-    return _short("Each share with the other causes kept", head, rows, 3) if rows else None
-
-
-def comparison_html(c: Comparison) -> str:
-    """Who agrees with whom, and which setting separates the others."""
-    from gapcert_figures import Figures
-
-    from .pages.compare import hero
-
-    return shown(*_compared(c.summary), _pairs(c.summary), pictures=hero(c.summary, Figures(compare=c.figure)))
+    return _short("Each share with the other causes kept", head, rows, 3)
 
 
 def _compared(summary: Summary) -> tuple[list[object], str]:
@@ -157,7 +133,7 @@ def _compared(summary: Summary) -> tuple[list[object], str]:
     return [_verdict(word, kind), *(h("p", s) for s in sentences(summary))], kind
 
 
-def _pairs(summary: Summary) -> Html | None:
+def _pairs(summary: Summary) -> Html:
     from .words.compare import setting_name, share
 
     rows = []
@@ -169,79 +145,129 @@ def _pairs(summary: Summary) -> Html | None:
             number(p["mean"]), number(p["max"]),
         ))  # fmt: skip
     head = ("pair", "they", "closed by", "mean difference", "largest")
-    return _short("After one step, in the unit of each state", head, rows, 3) if rows else None
-
-
-def run_html(folder: Path, summary: Summary, runs: Sequence[Summary] = ()) -> str:
-    """Of a finished run: the report's first screen, small; of a matrix a row for each."""
-    from gapcert_figures import Figures
-
-    from .pages import compare
-    from .pictures.album import album_of
-
-    if runs:
-        rows = [(r["name"], words.verdict(r)[0], str(r.get("reason") or "")) for r in runs]
-        return shown(
-            [h("p", f"{times(len(rows), 'run')}", class_="verdict")],
-            "open",
-            _short("", ("run", "verdict", "why"), rows, 3),
-        )
-    word, kind, meaning = words.verdict(summary)
-    said: list[object] = [_verdict(f"{summary.get('name', folder.name)}: {word.lower()}", kind)]
-    parts: list[Html | None] = []
-    if "certificate" in summary:
-        c = summary["certificate"]
-        said += [h("p", words.claim_sentence(c)), h("p", f"{words.tightness_sentence(c)} {words.loop_sentence(summary)}")]
-        parts = [_states(c), _assumed(c)]
-    elif "causes" in summary:
-        said, parts = [said[0], *_diagnosed(summary)[0][1:]], [_causes(summary)]
-    elif "pairs" in summary:
-        said, parts = [said[0], *_compared(summary)[0][1:]], [_pairs(summary)]
-    if summary["verdict"] in ("fails", "unknown") or len(said) == 1:
-        said.append(h("p", summary.get("reason") or meaning))
-    expected = summary.get("expectations", ())
-    met = f"{sum(bool(e['met']) for e in expected)} of {len(expected)} expectations met. " if expected else ""
-    parts.append(h("p", f"{met}Folder: {folder}", class_="note"))
-    figures = Figures.load(folder) if folder.is_dir() else Figures()
-    drawn = compare.hero(summary, figures) if "pairs" in summary else album_of(figures, summary).hero
-    return shown(said, kind, *parts, pictures=drawn)
-
-
-def recording_html(c: CalibratedRecording) -> str:
-    """A certificate of a recording, with the scores of its windows."""
-    from gapcert_figures import recorded_figure
-
-    from .pictures.gap import recorded_pictures
-
-    return certificate_html(c.summary(), recorded_pictures(recorded_figure(c)))
+    return _short("After one step, in the unit of each state", head, rows, 3)
 
 
 def certificate_line(c: Summary, name: str) -> str:
     """`Certificate(statistical, γ 1.005 × the gap of theta, 0 of 14,502 audited points outside)`."""
-    tight = [f"γ {s['tightness']:.3f} × the gap of {n}" for n, s in c["states"].items() if s.get("tightness") is not None]
+    tight = [f"γ {t:.3f} × the gap of {n}" for n, t in words.tightness(c).items()]
     audit = c.get("audit")
     seen = [f"{audit['violations']:,} of {audit['points']:,} audited points outside"] if audit else []
     level = "REFUTED" if words.refutation(c) is not None else c["claim"]["kind"]
     return f"{name}({', '.join([level, *tight, *seen])})"
 
 
-def diagnosis_line(d: Diagnosis) -> str:
-    """`Diagnosis(causes: coulomb-friction at q 92 %)`."""
-    named = ", ".join(f"{c.effect} at {c.site} {c.explained:.0%}" for c in d.causes)
-    return f"Diagnosis({d.verdict}{': ' + named if named else ''})"
+@final
+class CertificateView(View):
+    """Of a Certificate, or a Declaration."""
+
+    def line(self, value: Any) -> str:
+        return certificate_line(value.summary(), type(value).__name__)
+
+    def html(self, value: Any) -> str:
+        return certificate_html(value.summary())
 
 
-def comparison_line(summary: Summary) -> str:
-    """`Comparison(differ: 2 of 6 pairs of 4 simulators, 1 explained)`."""
-    differ, pairs = summary["differ"], summary["pairs"]
-    return (
-        f"Comparison({summary['verdict']}: {differ['pairs']} of {len(pairs)} pairs of {len(summary['backends'])} simulators "
-        f"differ, {differ['explained']} explained)"
-    )
+@final
+class RecordingView(View):
+    """Of a certificate on a recording, with the scores of its windows."""
+
+    def line(self, value: Any) -> str:
+        return certificate_line(value.summary(), type(value).__name__)
+
+    def html(self, value: Any) -> str:
+        from gapcert_figures import recorded_figure
+
+        from .pictures.gap import recorded_pictures
+
+        return certificate_html(value.summary(), recorded_pictures(recorded_figure(value)))
 
 
-def run_line(folder: Path, summary: Summary, runs: Sequence[Summary]) -> str:
-    """`Run(pendulum: holds, runs/pendulum-1a2b3c4d)`."""
-    if runs:
-        return f"Run({len(runs)} runs: {', '.join(str(r['verdict']) for r in runs)})"
-    return f"Run({summary.get('name', folder.name)}: {summary.get('verdict', 'unfinished')}, {folder})"
+@final
+class DiagnosisView(View):
+    """Of a Diagnosis: what was found, its numbers, and the pictures that carry the answer."""
+
+    def line(self, value: Any) -> str:
+        """`Diagnosis(causes: coulomb-friction at q 92 %)`."""
+        named = ", ".join(f"{c.effect} at {c.site} {c.explained:.0%}" for c in value.causes)
+        return f"Diagnosis({value.verdict}{': ' + named if named else ''})"
+
+    def sentence(self, value: Any) -> str:
+        from .words.diagnosis import sentence
+
+        return sentence(value.summary())
+
+    def html(self, value: Any) -> str:
+        from .pictures.diagnosis import diagnosis_album
+
+        summary = value.summary()
+        return shown(*_diagnosed(summary), _causes(summary), pictures=diagnosis_album(value.figure, summary).hero)
+
+
+@final
+class ComparisonView(View):
+    """Of a Comparison: who agrees with whom, and which setting separates the others."""
+
+    def line(self, value: Any) -> str:
+        """`Comparison(differ: 2 of 6 pairs of 4 simulators, 1 explained)`."""
+        s, differ = value.summary, value.summary["differ"]
+        of = f"{differ['pairs']} of {len(s['pairs'])} pairs of {len(s['backends'])} simulators"
+        return f"Comparison({s['verdict']}: {of} differ, {differ['explained']} explained)"
+
+    def html(self, value: Any) -> str:
+        from gapcert_figures import Figures
+
+        from .pages.compare import hero
+
+        drawn = hero(value.summary, Figures(compare=value.figure))
+        return shown(*_compared(value.summary), _pairs(value.summary), pictures=drawn)
+
+
+@final
+class RunView(View):
+    """Of a Run, or of a matrix of them."""
+
+    def line(self, value: Any) -> str:
+        """`Run(pendulum: holds, runs/pendulum-1a2b3c4d)`."""
+        if value.runs:
+            return f"Run({len(value.runs)} runs: {', '.join(str(r.summary['verdict']) for r in value.runs)})"
+        summary, folder = value.summary, value.folder
+        return f"Run({summary.get('name', folder.name)}: {summary.get('verdict', 'unfinished')}, {folder})"
+
+    def lines(self, summary: Summary) -> Iterator[str]:
+        from .words.summary import in_words
+
+        return in_words(summary)
+
+    def html(self, value: Any) -> str:
+        """The report's first screen, small; of a matrix a row for each."""
+        from gapcert_figures import Figures
+
+        from .pages import compare
+        from .pictures.album import album_of
+
+        folder, summary = value.folder, value.summary
+        if value.runs:
+            every = [r.summary for r in value.runs]
+            rows = [(s["name"], words.verdict(s)[0], str(s.get("reason") or "")) for s in every]
+            counted = h("p", times(len(rows), "run"), class_="verdict")
+            return shown([counted], "open", _short("", ("run", "verdict", "why"), rows, 3))
+        word, kind, meaning = words.verdict(summary)
+        said: list[object] = [_verdict(f"{summary.get('name', folder.name)}: {word.lower()}", kind)]
+        parts: list[Html | None] = []
+        if "certificate" in summary:
+            c = summary["certificate"]
+            said += [h("p", words.claim_sentence(c)), h("p", f"{words.tightness_sentence(c)} {words.loop_sentence(summary)}")]
+            parts = [_states(c), _assumed(c)]
+        elif "causes" in summary:
+            said, parts = [said[0], *_diagnosed(summary)[0][1:]], [_causes(summary)]
+        elif "pairs" in summary:
+            said, parts = [said[0], *_compared(summary)[0][1:]], [_pairs(summary)]
+        if summary["verdict"] in ("fails", "unknown") or len(said) == 1:
+            said.append(h("p", summary.get("reason") or meaning))
+        expected = summary.get("expectations", ())
+        met = f"{sum(bool(e['met']) for e in expected)} of {len(expected)} expectations met. " if expected else ""
+        parts.append(h("p", f"{met}Folder: {folder}", class_="note"))
+        figures = Figures.load(folder) if folder.is_dir() else Figures()
+        drawn = compare.hero(summary, figures) if "pairs" in summary else album_of(figures, summary).hero
+        return shown(said, kind, *parts, pictures=drawn)

@@ -33,5 +33,5 @@ def gapcert_components() -> list[Component]:
         Component(
             "command", "report", "write the HTML report of a run again", "gapcert_report.commands:report", arguments=(RUN,)
         ),
-        *(Component("view", name, text, f"gapcert_report.views:{view}View") for name, (view, text) in _VIEWS.items()),
+        *(Component("view", name, text, f"gapcert_report.notebook:{view}View") for name, (view, text) in _VIEWS.items()),
     ]

@@ -15,6 +15,7 @@ from gapcert_report.words.diagnosis import (
     briefly,
     cause_name,
     experiment_sentence,
+    explained,
     measured,
     numbers,
     plus_minus,
@@ -94,7 +95,7 @@ def _causes(summary: Summary) -> Html | None:
     for c in summary["causes"]:
         for name, value in numbers(c):
             engine = (c.get("native") or "–",) if native else ()
-            rows.append((cause_name(c), *engine, name, whole(value), f"{100 * c['explained']:.1f} %"))
+            rows.append((cause_name(c), *engine, name, whole(value), explained(c)))
     if not rows:
         return None
     open_ = summary["verdict"] == "unexplained"
@@ -120,12 +121,8 @@ def _refitted(summary: Summary) -> Html | None:
 
 def _rivals(summary: Summary) -> Html | None:
     """What else was tried in place of each cause."""
-    rows = []
-    for c in summary["causes"]:
-        r = c.get("runner_up")
-        if r:
-            explains = f"{100 * r['explained']:.1f} %"
-            rows.append((cause_name(c), cause_name(r), f"{100 * c['explained']:.1f} %", explains, number(r.get("margin"), 3)))
+    both = [(c, r) for c in summary["causes"] if (r := c.get("runner_up"))]
+    rows = [(cause_name(c), cause_name(r), explained(c), explained(r), number(r.get("margin"), 3)) for c, r in both]
     head = ("cause", "best rival in its place", "the cause explains", "the rival explains", "behind by (ΔS)")
     limits = (
         "A rival less than 10 behind could not be told apart; where one law contains the other, whose numbers are charged "

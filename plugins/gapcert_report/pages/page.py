@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from gapcert.plugin import DAMAGE, times
 from gapcert_closed_loop import broken_sentence
 from gapcert_figures import Figures
-from gapcert_report.links import contents, neighbours
 from gapcert_report.pictures.album import Album, album_of
 from gapcert_report.words import words
 from gapcert_report.words.diagnosis import cause_name, sentence, whole
@@ -78,7 +79,7 @@ def tiles(summary: Summary) -> Html | None:
     """The few numbers that a reader looks for: (class, value, unit, what it is)."""
     items: list[tuple[str, str, str, str]] = []
     certificate, loop = summary.get("certificate", {}), summary.get("closed_loop", {})
-    tight = {name: s["tightness"] for name, s in certificate.get("states", {}).items() if s.get("tightness") is not None}
+    tight = words.tightness(certificate)
     if len(tight) > words.MANY:
         ends = f"{min(tight.values()):.3f}\u00a0–\u00a0{max(tight.values()):.3f}\u00a0×"
         items.append(("", ends, "", f"mean γ over mean gap, {len(tight)} states"))
@@ -362,6 +363,27 @@ def _flat(timings: Summary) -> list[tuple[str, Any]]:
     for k, v in timings.items():
         out += [(f"{k} {a}", b) for a, b in _flat(v)] if isinstance(v, Mapping) else [(k, v)]
     return out
+
+
+def contents(body: Html) -> tuple[Html, Html]:
+    """Links to the sections, and the page with the places that they lead to."""
+    names = re.findall("<h2>(.*?)</h2>", body)
+    for k, name in enumerate(names):
+        body = Html(body.replace(f"<h2>{name}</h2>", f'<h2 id="part{k}">{name}</h2>', 1))
+    links = (h("a", Html(name), href=f"#part{k}") for k, name in enumerate(names))
+    return h("nav", *links, class_="contents", aria_label="On this page"), body
+
+
+def neighbours(folder: Path) -> Html | None:
+    """Links to the other runs of a matrix."""
+    if not (file := folder / "matrix.json").is_file():
+        return None
+    links = []
+    for one in json.loads(file.read_text(encoding="utf-8")):
+        text = ", ".join(f"{k} = {v}" for k, v in one["values"].items()) or one["folder"]
+        here = {"aria_current": "page"} if one["folder"] == folder.name else {}
+        links.append(h("a", text, href=f"../{quote(one['folder'])}/report.html", **here))
+    return h("nav", h("span", "Runs of this matrix:"), *links, aria_label="Runs of this matrix")
 
 
 def page(summary: Summary, figures: Figures, folder: Path, version: str) -> Html:

@@ -227,10 +227,6 @@ class DiagnosisAlbum:
     left: tuple[Picture, ...] = ()
     experiment: tuple[Picture, ...] = ()
 
-    @property
-    def all(self) -> tuple[Picture, ...]:
-        return (*self.hero, *self.motions, *self.laws, *self.other_laws, *self.left, *self.experiment)
-
 
 def diagnosis_album(d: DiagnosisFigure | None, summary: Mapping[str, Any]) -> DiagnosisAlbum:
     """The hero is what a colleague is shown first: measured against simulated, the first law, and the waterfall."""

@@ -9,7 +9,7 @@ from gapcert.plugin import times
 from gapcert_figures import called
 
 from .diagnosis import cause_name, measured
-from .words import listed, number
+from .words import listed, markdown_table, number
 
 Summary = Mapping[str, Any]
 
@@ -145,8 +145,8 @@ def _who(pairs: Sequence[Summary], order: Iterable[str]) -> str:
 
 def compare_markdown(summary: Summary) -> str:
     """The answer and the pairs as text, for viewers that show markdown."""
-    lines = ["| pair | mean | largest | closed by |", "| --- | --- | --- | --- |"]
+    rows = []
     for p in summary["pairs"]:
         named = setting_name(p["explained_by"][0]) if p["explained_by"] else "agree" if p.get("resolved") is False else ""
-        lines.append(f"| {p['a']}, {p['b']} | {number(p['mean'])} | {number(p['max'])} | {p.get('refused', named)} |")
-    return "\n\n".join([*sentences(summary), "\n".join(lines)])
+        rows.append((f"{p['a']}, {p['b']}", number(p["mean"]), number(p["max"]), p.get("refused", named)))
+    return "\n\n".join([*sentences(summary), markdown_table(("pair", "mean", "largest", "closed by"), rows)])

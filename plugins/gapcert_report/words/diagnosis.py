@@ -9,7 +9,7 @@ from typing import Any
 from gapcert.plugin import pretty, share
 from gapcert_figures import KINDS, called, spoken
 
-from .words import listed, number, refutation
+from .words import listed, markdown_table, number, refutation
 
 Summary = Mapping[str, Any]
 SETTINGS = {
@@ -70,6 +70,11 @@ def numbers(cause: Summary) -> Iterator[tuple[str, str]]:
         return
     for name, p in cause["parameters"].items():
         yield name.replace("_", " "), measured(plus_minus(p["value"], p["low"], p["high"]), p["unit"])
+
+
+def explained(cause: Summary) -> str:
+    """How much of the held-out error goes with a cause."""
+    return f"{100 * cause['explained']:.1f} %"
 
 
 def setting_value(value: Any) -> str:
@@ -281,14 +286,14 @@ def diagnosis_markdown(summary: Summary) -> Iterator[str]:
     rows = []
     for c in summary["causes"]:
         if c.get("setting"):
-            rows += [(cause_name(c), name, value, "", f"{100 * c['explained']:.1f} %") for name, value in numbers(c)]
+            rows += [(cause_name(c), name, value, "", explained(c)) for name, value in numbers(c)]
             continue
         for name, p in c["parameters"].items():
             value = measured(number(p["value"]), p["unit"])
             limits = f"{number(p['low'])} to {number(p['high'])}"
-            rows.append((cause_name(c), name, value, limits, f"{100 * c['explained']:.1f} %"))
+            rows.append((cause_name(c), name, value, limits, explained(c)))
     if rows:
         head = ("cause", "parameter", "value", "95 % interval", "explains")
-        yield "\n".join(f"| {' | '.join(row)} |" for row in (head, ("---",) * len(head), *rows))
+        yield markdown_table(head, rows)
     yield from (f"Mean γ of {n}: {number(a)} before, {number(b)} with the causes in the model." for n, a, b in shrunk(summary))
     yield won_sentence(summary)

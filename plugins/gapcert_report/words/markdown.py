@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from .compare import compare_markdown
 from .diagnosis import diagnosis_markdown
-from .words import claim_sentence, loop_sentence, number, plain
-
-
-def _markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ("---",) * len(head), *rows))
+from .words import claim_sentence, loop_sentence, markdown_table, number, plain
 
 
 def markdown(summary: Mapping[str, Any]) -> str:
@@ -25,8 +21,9 @@ def markdown(summary: Mapping[str, Any]) -> str:
         if not any("gamma_mean" in s for s in c["states"].values()):
             columns = {"gamma_max": "declared γ"}
         known = {k: title for k, title in columns.items() if any(s.get(k) is not None for s in c["states"].values())}
-        rows = [(_doubtful(name, s), *(number(s.get(k), 3) for k in known)) for name, s in c["states"].items()]
-        parts += [claim_sentence(c), loop_sentence(summary), _markdown_table(("state", *known.values()), rows)]
+        named = {n: f"{n} (vacuous)" if s.get("vacuous") else n for n, s in c["states"].items()}
+        rows = [(named[name], *(number(s.get(k), 3) for k in known)) for name, s in c["states"].items()]
+        parts += [claim_sentence(c), loop_sentence(summary), markdown_table(("state", *known.values()), rows)]
         parts += ["## Assumptions", "\n".join(f"{i}. {plain(a)}" for i, a in enumerate(c["assumptions"], 1)) or "None."]
         if "samples" in c:
             parts += [f"Transitions spent: {', '.join(f'{k} {v:,}' for k, v in c['samples'].items())}."]
@@ -35,7 +32,3 @@ def markdown(summary: Mapping[str, Any]) -> str:
     if "causes" in summary:
         parts += diagnosis_markdown(summary)
     return "\n\n".join(p for p in parts if p) + "\n"
-
-
-def _doubtful(name: str, state: Mapping[str, Any]) -> str:
-    return f"{name} (vacuous)" if state.get("vacuous") else name

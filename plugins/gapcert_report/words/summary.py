@@ -12,7 +12,7 @@ from gapcert_closed_loop import broken_sentence
 from . import compare as compare_words
 from .compare import setting_name
 from .diagnosis import numbers, refitted_named, shrunk, won_sentence
-from .words import hidden_sentence, learned_sentence
+from .words import hidden_sentence, learned_sentence, on_the_way
 
 
 def in_words(summary: Mapping[str, Any]) -> Iterator[str]:
@@ -39,13 +39,9 @@ def in_words(summary: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _number(value: Any) -> str:
-    return (
-        f"{value:.4g}"
-        if isinstance(value, int | float) and not isinstance(value, bool)
-        else "-"
-        if value is None
-        else str(value)
-    )
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return f"{value:.4g}"
+    return "-" if value is None else str(value)
 
 
 def _certificate(certificate: Mapping[str, Any]) -> Iterator[str]:
@@ -84,8 +80,7 @@ def _controller(summary: Mapping[str, Any]) -> Iterator[str]:
     loop = summary.get("closed_loop", {})
     for key, name in (("with_gamma", "with γ"), ("without_gamma", "without γ")):
         if row := loop.get(key):
-            late = row["starts"] - row["violations"] - row["reached"] if "reached" in row else 0
-            tail = f", {late} are still on the way" if late else ""
+            tail = f", {late} are still on the way" if (late := on_the_way(row)) else ""
             tail += f", {row['refused']} of the starts drawn are refused" if row.get("refused") else ""
             tail += f", {row['fallbacks']} steps went on with a plan of before" if row.get("fallbacks") else ""
             yield f"  closed loop {name}: {row['violations']} of {row['starts']} runs fail{tail} (policy {row['policy']})"
@@ -98,11 +93,8 @@ def _controller(summary: Mapping[str, Any]) -> Iterator[str]:
         )
     if "learned" in loop:
         yield f"  {learned_sentence(loop)}"
-    yield from (f"  {broken_sentence(r)}" for r in loop.get("policies", ()) if _broken(r))
-
-
-def _broken(row: Mapping[str, Any]) -> bool:
-    return row["controller"] == "with_gamma" and bool(row.get("broken_promises"))
+    ours = [r for r in loop.get("policies", ()) if r["controller"] == "with_gamma"]
+    yield from (f"  {broken_sentence(r)}" for r in ours if r.get("broken_promises"))
 
 
 def _comparison(summary: Mapping[str, Any]) -> Iterator[str]:
@@ -128,7 +120,8 @@ def _comparison(summary: Mapping[str, Any]) -> Iterator[str]:
 def _diagnosis(summary: Mapping[str, Any]) -> Iterator[str]:
     if "causes" not in summary:
         return
-    yield from (f"  {text}" for text in [summary.get("sentence")] if text)
+    if text := summary.get("sentence"):
+        yield f"  {text}"
     for cause in summary["causes"]:
         values = ", ".join(
             f"{n} = {_number(p['value'])}{'' if p['unit'] == '1' else ' ' + p['unit']}" for n, p in cause["parameters"].items()
@@ -143,6 +136,7 @@ def _diagnosis(summary: Mapping[str, Any]) -> Iterator[str]:
     yield from (f"  assumed: {text}" for text in summary.get("assumptions", ()))
     for name, old, new in shrunk(summary):
         yield f"  mean γ of {name}: {_number(old)} before, {_number(new)} with the causes in the model"
-    yield from (f"  {text}" for text in [won_sentence(summary)] if text)
+    if text := won_sentence(summary):
+        yield f"  {text}"
     if path := summary.get("experiment_file"):
         yield f"  the input to play: {path}"

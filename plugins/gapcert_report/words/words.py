@@ -163,13 +163,15 @@ def symbols(certificate: Mapping[str, Any]) -> str:
     )
 
 
+def tightness(certificate: Mapping[str, Any]) -> dict[str, float]:
+    """Mean γ over mean gap, of the states that have one."""
+    return {n: s["tightness"] for n, s in certificate.get("states", {}).items() if s.get("tightness") is not None}
+
+
 def tightness_sentence(certificate: Mapping[str, Any]) -> str:
     """How much larger γ is than the gap it bounds, over the audit's points."""
-    parts = [
-        f"{s['tightness']:.3f} × the mean gap of {name}"
-        for name, s in certificate["states"].items()
-        if s.get("tightness") is not None
-    ]
+    tight = tightness(certificate)
+    parts = [f"{t:.3f} × the mean gap of {name}" for name, t in tight.items()]
     if not parts and "audit" not in certificate and "recording" not in certificate:
         return ""
     if not parts:
@@ -177,8 +179,8 @@ def tightness_sentence(certificate: Mapping[str, Any]) -> str:
     empty = [name for name, s in certificate["states"].items() if s.get("vacuous")]
     told = f"γ is on average {listed(parts)}."
     if len(parts) > MANY:
-        all_of = [s["tightness"] for s in certificate["states"].values() if s.get("tightness") is not None]
-        told = f"γ is on average {min(all_of):.3f} to {max(all_of):.3f} × the mean gap of each of {len(parts)} states."
+        least, most = min(tight.values()), max(tight.values())
+        told = f"γ is on average {least:.3f} to {most:.3f} × the mean gap of each of {len(parts)} states."
     return told + (
         f" For {listed(empty)} it is vacuous: a constant, or a model in which nothing moves, would do as well." if empty else ""
     )
@@ -287,3 +289,8 @@ def listed(items: Sequence[str]) -> str:
 def some(items: Sequence[str], most: int) -> str:
     """`a, b and 4 more`."""
     return listed([*items[:most], f"{len(items) - most:,} more"] if len(items) > most else items)
+
+
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """As viewers that show markdown want it."""
+    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ("---",) * len(head), *rows))
