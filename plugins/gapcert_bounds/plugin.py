@@ -1,96 +1,46 @@
 """Declares what this package offers; imports nothing but gapcert."""
 
+from typing import Any
+
 import gapcert
 
 CONFIG = "gapcert_bounds.config"
+_SAMPLED = {"claim": "statistical"}
+_ESTIMATORS: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "declared": ("lipschitz:Declared", "constants that the user states", {}),
+    "interval": ("lipschitz:IntervalJacobian", "constants proved from the equations of both systems", {}),
+    "wood-zhang": ("wood_zhang:WoodZhang", "constants estimated from sampled slopes by extreme value theory", _SAMPLED),
+    "gradient-elite": (
+        "gradient_elite:GradientElite", "constants estimated from slopes searched for around the steepest", _SAMPLED,
+    ),
+    "piecewise": (
+        "piecewise:Piecewise", "constants per cell and jumps where slopes grow, estimated from close pairs", _SAMPLED,
+    ),
+}  # fmt: skip
+_FAMILIES: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "constant": ("constant:Constant", "the smallest certified constant", {}),
+    "declared": (
+        "constant:Declared", "a constant that the user states", {"claim": "assumed", "config": f"{CONFIG}:DeclaredGapConfig"},
+    ),
+    "envelope": ("envelope:Envelope", "the tightest band that samples and constants allow", {}),
+    "multilinear": ("multilinear:Multilinear", "interpolation on a lattice, and what curvature allows it to miss", {}),
+    "basis": (
+        "basis:Basis", "a sum of named basis functions by the scenario program",
+        {"requires": ("cvxpy", "clarabel"), "extra": "basis"},
+    ),
+}  # fmt: skip
 
 
 @gapcert.hookimpl
 def gapcert_components() -> list[gapcert.Component]:
-    return [*_estimators(), *_families()]
+    """Estimators of constants, and families of gap functions; their options bear the names of their classes."""
+    return [*_declared("lipschitz", "constants", _ESTIMATORS), *_declared("gap_family", "families", _FAMILIES)]
 
 
-def _estimators() -> list[gapcert.Component]:
+def _declared(kind: str, folder: str, offered: dict[str, tuple[str, str, dict[str, Any]]]) -> list[gapcert.Component]:
     return [
         gapcert.Component(
-            "lipschitz",
-            "declared",
-            "constants that the user states",
-            "gapcert_bounds.constants.lipschitz:Declared",
-            f"{CONFIG}:DeclaredConfig",
-        ),
-        gapcert.Component(
-            "lipschitz",
-            "interval",
-            "constants proved from the equations of both systems",
-            "gapcert_bounds.constants.lipschitz:IntervalJacobian",
-            f"{CONFIG}:IntervalJacobianConfig",
-        ),
-        gapcert.Component(
-            "lipschitz",
-            "wood-zhang",
-            "constants estimated from sampled slopes by extreme value theory",
-            "gapcert_bounds.constants.wood_zhang:WoodZhang",
-            f"{CONFIG}:WoodZhangConfig",
-            claim="statistical",
-        ),
-        gapcert.Component(
-            "lipschitz",
-            "gradient-elite",
-            "constants estimated from slopes searched for around the steepest",
-            "gapcert_bounds.constants.gradient_elite:GradientElite",
-            f"{CONFIG}:GradientEliteConfig",
-            claim="statistical",
-        ),
-        gapcert.Component(
-            "lipschitz",
-            "piecewise",
-            "constants per cell and jumps where slopes grow, estimated from close pairs",
-            "gapcert_bounds.constants.piecewise:Piecewise",
-            f"{CONFIG}:PiecewiseConfig",
-            claim="statistical",
-        ),
-    ]
-
-
-def _families() -> list[gapcert.Component]:
-    return [
-        gapcert.Component(
-            "gap_family",
-            "constant",
-            "the smallest certified constant",
-            "gapcert_bounds.families.constant:Constant",
-            f"{CONFIG}:ConstantConfig",
-        ),
-        gapcert.Component(
-            "gap_family",
-            "declared",
-            "a constant that the user states",
-            "gapcert_bounds.families.constant:Declared",
-            f"{CONFIG}:DeclaredGapConfig",
-            claim="assumed",
-        ),
-        gapcert.Component(
-            "gap_family",
-            "envelope",
-            "the tightest band that samples and constants allow",
-            "gapcert_bounds.families.envelope:Envelope",
-            f"{CONFIG}:EnvelopeConfig",
-        ),
-        gapcert.Component(
-            "gap_family",
-            "multilinear",
-            "interpolation on a lattice, and what curvature allows it to miss",
-            "gapcert_bounds.families.multilinear:Multilinear",
-            f"{CONFIG}:MultilinearConfig",
-        ),
-        gapcert.Component(
-            "gap_family",
-            "basis",
-            "a sum of named basis functions by the scenario program",
-            "gapcert_bounds.families.basis:Basis",
-            f"{CONFIG}:BasisConfig",
-            requires=("cvxpy", "clarabel"),
-            extra="basis",
-        ),
+            kind, name, text, f"gapcert_bounds.{folder}.{home}", **{"config": f"{CONFIG}:{home.partition(':')[2]}Config"} | more
+        )
+        for name, (home, text, more) in offered.items()
     ]

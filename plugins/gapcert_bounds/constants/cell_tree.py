@@ -8,7 +8,7 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Array
+from gapcert import Array, Domain, Interval
 
 Index = npt.NDArray[np.intp]
 
@@ -33,6 +33,12 @@ class Leaf:
     def holds(self, low: Array, high: Array) -> npt.NDArray[np.bool_]:
         """(n,): the closed box meets the boxes [low, high] (n, nz)."""
         return np.asarray(((low <= self.high) & (high >= self.low)).all(axis=1))
+
+    def within(self, domain: Domain, z: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
+        """(points z (n, nz) moved into Z, which of them then lie in Z and in the closed box)."""
+        boxes = Interval(np.broadcast_to(self.low, z.shape), np.broadcast_to(self.high, z.shape))
+        moved = domain.inside(z, boxes)
+        return moved, np.asarray(domain.contains(moved) & self.holds(moved, moved))
 
     def halves(self, axis: int, cut: float) -> tuple[Leaf, Leaf]:
         """The two sides of a cut; they keep the region."""

@@ -11,7 +11,7 @@ from gapcert.plugin import LipschitzBound, LipschitzEstimator, LipschitzProblem
 
 from .bends import curvatures
 from .slopes import NOISE, Close, inert, uniform
-from .sweep import sweep
+from .sweep import Curvature, estimate
 
 _ROUNDS = 8
 _FIRST = 2  # parts of the pairs that the first round has, of which each later one has one
@@ -53,33 +53,23 @@ class GradientElite(LipschitzEstimator):
                 f"lipschitz gradient-elite: a budget of {self.budget} transitions is {count} pairs for each of "
                 f"{len(names)} axes; give at least {2 * share * least * len(names)}"
             )
-        value, lower = np.zeros((2, problem.domain.nx, len(problem.domain.axes)))
-        pairs, diagnostics = dict[int, Close](), dict[str, Any]()
+        pairs, values, diagnostics = dict[int, Close](), dict[int, tuple[Array, Array]](), dict[str, Any]()
         noise = 4 * problem.change_resolution
         for j, name in names.items():
             first, close, slope = self._search(problem, j, name, count, noise)
             seen = slope.max(axis=0)
             still = inert(problem, j, first, seen, noise, "gradient-elite")
-            value[:, j] = np.where(still, first.hidden(noise), seen * self.safety)
-            lower[:, j] = close.lower(noise)
+            values[j] = np.where(still, first.hidden(noise), seen * self.safety), close.lower(noise)
             pairs[j] = close
             diagnostics[name] = {"inert": still.tolist(), "largest_slope": seen.tolist(), "pairs": len(slope)}
             diagnostics[name]["largest_slope_of_random_pairs"] = first.slope.max(axis=0).tolist()
-        kinds, spent = sweep(problem, pairs)
-        diagnostics["sweep"] = kinds
-        samples = 2 * sum(len(close.start) for close in pairs.values()) + spent
-        steep = np.concatenate([close.steepest(1) for close in pairs.values()], axis=1)
         method = f"gradient-elite ({count} pairs in {_ROUNDS} rounds per axis)"
-        bent = None
-        if self.curvature:
+
+        def bent() -> Curvature:
             each = self.budget // (6 * len(names))
-            bent, diagnostics["curvature"], more = curvatures(
-                problem, names, each, self.distance, self.safety, "gradient-elite"
-            )
-            samples += more
-        return LipschitzBound(
-            value, lower, "estimated", method, self.safety, samples, steep=steep, curvature=bent, diagnostics=diagnostics
-        )
+            return curvatures(problem, names, each, self.distance, self.safety, "gradient-elite")
+
+        return estimate(problem, pairs, values, diagnostics, method, self.safety, bent if self.curvature else None)
 
     def _search(self, problem: LipschitzProblem, j: int, name: str, count: int, noise: Array) -> tuple[Close, Close, Array]:
         """(pairs of the first round, all pairs, their slopes (n, nx), 0 where the resolution may fake them) along axis j."""

@@ -121,6 +121,5 @@ def _largest(found: Array) -> Array:
 
 def _point(leaf: Leaf, domain: Domain) -> Array | None:
     """A point of Z in the cell: its middle, moved where relations ask for it; None where none is found."""
-    box = Interval(leaf.low[None], leaf.high[None])
-    point = domain.inside(box.mid, box)
-    return point[0] if domain.contains(point)[0] and leaf.holds(point, point)[0] else None
+    (point,), (known,) = leaf.within(domain, Interval(leaf.low[None], leaf.high[None]).mid)
+    return point if known else None

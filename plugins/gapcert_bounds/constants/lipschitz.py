@@ -13,6 +13,9 @@ import numpy as np
 from gapcert import Array, Interval, Model, UsageError
 from gapcert.plugin import LipschitzBound, LipschitzEstimator, LipschitzProblem, ModelPredictor
 
+from .interval_cells import Slopes, cells
+from .interval_curvature import halves, proved
+
 Bend = float | Sequence[Sequence[float]]
 T = TypeVar("T")
 _MOST_AXES = 12  # a cell is looked at in two parts per axis or more
@@ -102,27 +105,20 @@ class IntervalJacobian(LipschitzEstimator):
     def bound(self, problem: LipschitzProblem) -> LipschitzBound:
         whole, fhat = self._whole(problem), problem.white_box
         if self.curvature and fhat is not None:
-            from .interval_curvature import proved
-
             return proved(problem, fhat, whole, self.slabs, self.boxes)
         return whole if self.cells == 1 else self._cut(problem, whole)
 
     def _cut(self, problem: LipschitzProblem, whole: LipschitzBound) -> LipschitzBound:
-        from .interval_cells import Slopes, cells
-
         fhat, axes = problem.white_box, tuple(j for j in range(len(problem.domain.low)) if j not in problem.held)
         if fhat is None or len(axes) > _MOST_AXES:
             raise UsageError(
                 f"lipschitz interval: cells are cut along at most {_MOST_AXES} axes, found {len(axes)}; use cells: 1"
             )
-        made = cells(
-            Slopes(problem.domain, lambda b: _slopes(fhat, problem, b).mag, whole.value, axes, self.boxes // self.cells),
-            self.cells,
-        )
+        parts = self.boxes // self.cells
+        made = cells(Slopes(problem.domain, lambda b: _slopes(fhat, problem, b).mag, whole.value, axes, parts), self.cells)
         if len(made) == 1:
             return whole
-        method = f"interval ({len(made)} cells)"
-        return replace(whole, value=made.worst, method=method, cells=made)
+        return replace(whole, value=made.worst, method=f"interval ({len(made)} cells)", cells=made)
 
     def _whole(self, problem: LipschitzProblem) -> LipschitzBound:
         fhat = problem.white_box
@@ -143,10 +139,11 @@ class IntervalJacobian(LipschitzEstimator):
             count = min(self.boxes - len(boxes), max(1, len(boxes) // 2))
             order = np.argsort(-urgency, kind="stable")
             first, rest = order[:count], order[count:]
-            halves = _halve(boxes[first], problem.domain.width)
-            tighter = np.minimum(_slopes(fhat, problem, halves).mag, np.tile(bound[first], (2, 1, 1)))
-            lower = np.maximum(lower, _reached(fhat, problem, halves))
-            boxes, bound = Interval.concatenate([boxes[rest], halves]), np.concatenate([bound[rest], tighter])
+            cut = boxes[first]
+            parts = halves(cut, ((cut.hi - cut.lo) / problem.domain.width).argmax(axis=1))
+            tighter = np.minimum(_slopes(fhat, problem, parts).mag, np.tile(bound[first], (2, 1, 1)))
+            lower = np.maximum(lower, _reached(fhat, problem, parts))
+            boxes, bound = Interval.concatenate([boxes[rest], parts]), np.concatenate([bound[rest], tighter])
         value = bound.max(axis=0)
         if not np.isfinite(value).all():
             i, j = np.argwhere(~np.isfinite(value))[0]
@@ -177,11 +174,3 @@ def _slopes(fhat: Model, problem: LipschitzProblem, boxes: Interval) -> Interval
 def _reached(fhat: Model, problem: LipschitzProblem, boxes: Interval) -> Array:
     """A slope that is proved to occur: the smallest |∂| that each centre's own enclosure allows, maximised over boxes."""
     return np.asarray(abs(_slopes(fhat, problem, Interval.exact(boxes.mid))).lo.max(axis=0))
-
-
-def _halve(boxes: Interval, scale: Array) -> Interval:
-    axis = ((boxes.hi - boxes.lo) / scale).argmax(axis=1)
-    rows = np.arange(len(boxes))
-    low, high = boxes.lo.copy(), boxes.hi.copy()
-    low[rows, axis] = high[rows, axis] = boxes.mid[rows, axis]
-    return Interval.concatenate([Interval(boxes.lo, high), Interval(low, boxes.hi)])

@@ -7,7 +7,7 @@ from typing import final
 
 import numpy as np
 
-from gapcert import Array, Interval, UsageError
+from gapcert import Array, UsageError
 from gapcert.plugin import Bools, Cells, LipschitzBound, LipschitzEstimator, LipschitzProblem
 
 from .cell_tree import Leaf, Tree, edges
@@ -188,9 +188,8 @@ class _Search:
 
     def _inside(self, leaf: Leaf, z: Array) -> Array:
         """Points z of the leaf, moved into Z; those that cannot be are left out."""
-        boxes = Interval(np.broadcast_to(leaf.low, z.shape), np.broadcast_to(leaf.high, z.shape))
-        moved = self.domain.inside(z, boxes)
-        return np.asarray(moved[self.domain.contains(moved) & leaf.holds(moved, moved)])
+        moved, known = leaf.within(self.domain, z)
+        return np.asarray(moved[known])
 
     def _split_by_jump(self) -> None:
         """Halve the cells whose jumps cost most, across the jump; a jump is pursued from cell to cell along their edges."""
@@ -286,9 +285,7 @@ class _Search:
 
     def _corners(self, leaf: Leaf) -> tuple[Array, Bools]:
         """(corners moved into Z, which of them are in Z and in the leaf); the others stand at the leaf's point."""
-        z = leaf.corners()
-        moved = self.domain.inside(z, Interval(np.broadcast_to(leaf.low, z.shape), np.broadcast_to(leaf.high, z.shape)))
-        known = self.domain.contains(moved) & leaf.holds(moved, moved)
+        moved, known = leaf.within(self.domain, leaf.corners())
         stand_in = self._point(leaf)
         return np.where(known[:, None], moved, stand_in if stand_in is not None else self.domain.centre), known
 

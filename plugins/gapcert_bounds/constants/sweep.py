@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array
-from gapcert.plugin import LipschitzProblem, Trails
+from gapcert.plugin import LipschitzBound, LipschitzProblem, Trails
 
 from .slopes import Close
 
@@ -21,6 +21,32 @@ _CLEAR = 64.0  # changes below so many resolutions tell nothing
 _FLAT = 1.5  # a slope that grows by less has settled
 _GROWN = 4.0  # noise multiplies slopes by 16 in two steps
 _ALONE = 8.0  # times the random pairs' changes: what is left at a steep pair is a jump, and not the noise of all pairs
+
+
+Curvature = tuple[Array, list[dict[str, Any]], int]
+
+
+def estimate(
+    problem: LipschitzProblem,
+    pairs: Mapping[int, Close],
+    values: Mapping[int, tuple[Array, Array]],
+    diagnostics: Mapping[str, Any],
+    method: str,
+    safety: float,
+    curvature: Callable[[], Curvature] | None,
+) -> LipschitzBound:
+    """What close pairs along each axis say; values: estimates and proved lower bounds, (nx,) each, of the axes asked along."""
+    kinds, spent = sweep(problem, pairs)
+    samples = 2 * sum(len(close.start) for close in pairs.values()) + spent
+    told, bent = {**diagnostics, "sweep": kinds}, None
+    if curvature is not None:
+        bent, told["curvature"], more = curvature()
+        samples += more
+    value, lower = np.zeros((2, problem.domain.nx, len(problem.domain.axes)))
+    for j, (most, least) in values.items():
+        value[:, j], lower[:, j] = most, least
+    steep = np.concatenate([close.steepest(1) for close in pairs.values()], axis=1)
+    return LipschitzBound(value, lower, "estimated", method, safety, samples, steep=steep, curvature=bent, diagnostics=told)
 
 
 def sweep(problem: LipschitzProblem, pairs: Mapping[int, Close]) -> tuple[list[dict[str, Any]], int]:

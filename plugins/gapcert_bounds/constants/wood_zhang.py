@@ -13,7 +13,7 @@ from gapcert.plugin import LipschitzBound, LipschitzEstimator, LipschitzProblem
 from . import weibull
 from .bends import curvatures
 from .slopes import Close, inert, uniform
-from .sweep import sweep
+from .sweep import Curvature, estimate
 
 _FARTHEST = 2.0  # times the largest slope: maxima whose fitted end lies beyond show no end at all
 
@@ -50,31 +50,23 @@ class WoodZhang(LipschitzEstimator):
         """UsageError where the pairs are too close for the resolution."""
         names = {j: a.name for j, a in enumerate(problem.domain.axes) if j not in problem.held}
         pairs = {j: self._ask(problem, j, name) for j, name in names.items()}
-        values, lowers, reports = zip(*(self._axis(problem, j, close) for j, close in pairs.items()), strict=True)
-        kinds, spent = sweep(problem, pairs)
-        diagnostics = dict(zip(names.values(), reports, strict=True)) | {"sweep": kinds}
+        values, reports = dict[int, tuple[Array, Array]](), dict[str, Any]()
+        for j, name in names.items():
+            values[j], reports[name] = self._axis(problem, j, pairs[j])
         method = f"wood-zhang ({self.pairs} pairs in {self.batches} batches per axis)"
-        samples = 2 * self.pairs * len(names) + spent
-        steep = np.concatenate([close.steepest(1) for close in pairs.values()], axis=1)
-        value, lower = np.zeros((2, problem.domain.nx, len(problem.domain.axes)))
-        value[:, list(names)], lower[:, list(names)] = np.stack(values, axis=1), np.stack(lowers, axis=1)
-        bent = None
-        if self.curvature:
-            bent, diagnostics["curvature"], more = curvatures(
-                problem, names, self.pairs, self.distance, self.safety, "wood-zhang"
-            )
-            samples += more
-        return LipschitzBound(
-            value, lower, "estimated", method, self.safety, samples, steep=steep, curvature=bent, diagnostics=diagnostics
-        )
+
+        def bent() -> Curvature:
+            return curvatures(problem, names, self.pairs, self.distance, self.safety, "wood-zhang")
+
+        return estimate(problem, pairs, values, reports, method, self.safety, bent if self.curvature else None)
 
     def _ask(self, problem: LipschitzProblem, j: int, name: str) -> Close:
         rng = np.random.default_rng([problem.seed, j, 0x12F])
         start, end = uniform(problem, j, rng, self.pairs, self.distance, "wood-zhang")
         return Close.ask(problem, f"lipschitz-{name}", j, start, end)
 
-    def _axis(self, problem: LipschitzProblem, j: int, close: Close) -> tuple[Array, Array, dict[str, Any]]:
-        """Estimates (nx,), proved lower bounds (nx,) and diagnostics for axis j."""
+    def _axis(self, problem: LipschitzProblem, j: int, close: Close) -> tuple[tuple[Array, Array], dict[str, Any]]:
+        """(estimates (nx,), proved lower bounds (nx,)), and diagnostics, for axis j."""
         noise, slope = 4 * problem.change_resolution, close.slope
         seen = slope.max(axis=0)
         still = inert(problem, j, close, seen, noise, "wood-zhang")
@@ -82,7 +74,7 @@ class WoodZhang(LipschitzEstimator):
         maxima = np.stack([part.max(axis=0) for part in np.array_split(slope, self.batches)], axis=1)
         fit = weibull.fit(maxima)
         location = np.minimum(fit.location, _FARTHEST * seen)
-        estimate = np.where(still, close.hidden(noise), np.maximum(location, seen) * self.safety)
+        estimated = np.where(still, close.hidden(noise), np.maximum(location, seen) * self.safety)
         report = {
             "inert": still.tolist(),
             "largest_slope": seen.tolist(),
@@ -90,7 +82,7 @@ class WoodZhang(LipschitzEstimator):
             "profile_limit_95": _finite(fit.upper, still),
             "note": "the profile limit is no confidence bound",
         }
-        return estimate, close.lower(noise), report
+        return (estimated, close.lower(noise)), report
 
 
 def _finite(values: Array, inert: npt.NDArray[np.bool_]) -> list[float | None]:

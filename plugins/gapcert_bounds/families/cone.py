@@ -34,11 +34,6 @@ class Cones:
     def __call__(self, z: Array) -> tuple[Array, Array]:
         n, nx = len(z), len(self._g)
         lower, upper = np.empty((nx, n)), np.empty((nx, n))
-        if n < _DIRECT:
-            points = np.ascontiguousarray(z.T)
-            for i in range(nx):
-                self._extremes(i, points, self._z, self._g[i], lower[i], upper[i])
-            return lower.T.copy(), upper.T.copy()
         order, starts = self._groups(z)
         points = np.ascontiguousarray(z[order].T)
         for i in range(nx):
@@ -51,18 +46,15 @@ class Cones:
 
     def lowest(self, i: int, sign: int, z: Array) -> npt.NDArray[np.intp]:
         """(n,): the number of a cone of sign · g that is smallest at each point z (n, nz)."""
-        order, starts, own = np.arange(len(z)), np.zeros(0, dtype=np.intp), sign * self._g[i]
-        if len(z) >= _DIRECT:
-            order, starts = self._groups(z)
+        (order, starts), own, every = self._groups(z), sign * self._g[i], np.arange(self._z.shape[1])
         points, out = np.ascontiguousarray(z[order].T), np.empty(len(z), dtype=np.intp)
-        whole = [(0, len(z), np.arange(len(own)))]
-        for start, stop, near in self._candidates(i, points, starts) if len(starts) else whole:
-            rows = max(1, _BLOCK // max(1, len(near)))
+        for start, stop, near in self._candidates(i, points, starts):
+            rows = max(1, _BLOCK // max(1, len(every[near])))
             for a in range(start, stop, rows):
                 part = slice(a, min(a + rows, stop))
                 work = self._distance(i, points[:, part], self._z[:, near])
                 work += own[near]
-                out[order[part]] = near[work.argmin(axis=1)]
+                out[order[part]] = every[near][work.argmin(axis=1)]
         return out
 
     def crest(self, i: int, sign: int, centre: Array, h: Array, slope: Array, worth: float = np.inf) -> Array:
@@ -186,7 +178,12 @@ class Cones:
         return total
 
     def _groups(self, z: Array) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-        """An order of the points in which near ones are neighbours, and where each group of them starts (with the end)."""
+        """An order of the points in which near ones are neighbours, and where each group of them starts (with the end).
+
+        Of few points no groups are made, as nothing would be won.
+        """
+        if len(z) < _DIRECT:
+            return np.arange(len(z)), np.zeros(0, dtype=np.intp)
         low, width = z.min(axis=0), np.ptp(z, axis=0)
         weight = self._lipschitz * width
         total = weight.sum(axis=1, keepdims=True)
@@ -205,12 +202,15 @@ class Cones:
 
     def _candidates(
         self, i: int, points: Array, starts: npt.NDArray[np.intp]
-    ) -> Iterator[tuple[int, int, npt.NDArray[np.intp]]]:
-        """Per group: its start and end, and the cones that can be extreme at one of its points.
+    ) -> Iterator[tuple[int, int, npt.NDArray[np.intp] | slice]]:
+        """Per group: its start and end, and the cones that can be extreme at one of its points; without groups, all of them.
 
         Over a group with centre c and half-widths h no cone moves by more than ρ = Σ_j L_j h_j, so one that lies 2 ρ above the
         smallest at c is nowhere smallest. The bound on rounding is generous: a cone too many costs time only.
         """
+        if not len(starts):
+            yield 0, points.shape[1], slice(None)
+            return
         low, high = np.minimum.reduceat(points, starts[:-1], axis=1), np.maximum.reduceat(points, starts[:-1], axis=1)
         centres, half = (low + high) / 2, (high - low) / 2
         reach = 2 * self._lipschitz[i] @ half
