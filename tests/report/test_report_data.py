@@ -1,5 +1,6 @@
 """What a page tells of a picture is what was drawn: read off the axes, packed into JSON, and small."""
 
+import base64
 import json
 import re
 import shutil
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 
 import gapcert as gc
 from gapcert_figures.data import Figures
-from gapcert_report.pages.packed import packed, unpacked
+from gapcert_report.pages.packed import packed
 from gapcert_report.pictures.album import album_of
 from gapcert_report.pictures.gap import band_pictures, slice_pictures
 from gapcert_report.pictures.svg import draw, heat
@@ -46,6 +47,15 @@ def test_packed_arrays_are_small(values, kind):
     assert kind in data
     assert len(json.dumps(data)) < 7 * len(values)
     assert np.nanmax(np.abs(unpacked(data) - values)) <= 1e-7 * np.ptp(values[np.isfinite(values)])
+
+
+def unpacked(data):
+    """The array that `packed` was given, to seven digits."""
+    if "n" in data:
+        return np.asarray(data["first"] + data["step"] * np.arange(data["n"]))
+    if "runs" in data:
+        return np.concatenate([np.full(c, np.nan if v is None else v) for v, c in data["runs"]])
+    return np.asarray(np.frombuffer(base64.b64decode(data["f32"]), "<f4").astype(float) + data["offset"])
 
 
 def arrays(series):
