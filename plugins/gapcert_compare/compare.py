@@ -142,17 +142,14 @@ def _figure(model: Model, laboratory: Laboratory, measured: Sequence[Pair]) -> C
     axes = Axis.all_of(domain.states) + Axis.all_of(domain.inputs)
     drawn = []
     for pair in measured:
-        if "refused" in pair.summary:
+        if pair.at is None:
             continue
         values = np.empty((0, 0)) if pair.slice is None else pair.slice
         shown = map_axes(laboratory) if pair.slice is not None else ()
-        held = [f"{a.name} = {v:.3g} {a.unit}" for k, (a, v) in enumerate(zip(axes, _at(pair), strict=True)) if k not in shown]
+        at = enumerate(zip(axes, pair.at.tolist(), strict=True))
+        held = [f"{a.name} = {v:.3g} {a.unit}" for k, (a, v) in at if k not in shown]
         unit = axes[pair.state].unit
         drift = np.empty(0) if pair.drift is None else pair.drift
         names = pair.summary["a"], pair.summary["b"], pair.summary["state"], unit
         drawn.append(PairFigure(*names, tuple(axes[k] for k in shown), ", ".join(held), values, drift))
     return CompareFigure(model.period, tuple(drawn))
-
-
-def _at(pair: Pair) -> list[float]:
-    return [] if pair.at is None else pair.at.tolist()

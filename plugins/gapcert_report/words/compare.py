@@ -110,15 +110,12 @@ def sentences(summary: Summary) -> Iterator[str]:
             yield f"{who}, on average by up to {most} of what one step moves, and no setting that was tried closes it."
     for name in coarse(summary):
         friends = summary["backends"][name]["agrees_with"]
-        least = min(_resolution(p) for p in summary["pairs"] if name in (p["a"], p["b"]) and p.get("resolved") is False)
+        own = (p["states"].values() for p in summary["pairs"] if name in (p["a"], p["b"]) and p.get("resolved") is False)
+        least = min(max(float(s["resolution"]) for s in states) for states in own)
         yield (
             f"{name} cannot be told from {listed(friends)}, which differ: what its own solver may leave undone, up to "
             f"{number(least, 2)} a step, is more than lies between them."
         )
-
-
-def _resolution(pair: Summary) -> float:
-    return max(float(s["resolution"]) for s in pair["states"].values())
 
 
 def _closed(name: str, entry: Summary) -> str:
