@@ -103,7 +103,11 @@ def _digest(rows: Sequence[Mapping[str, Any]], answers: Mapping[str, str]) -> st
 
 def closed(pair: Mapping[str, Any]) -> bool:
     """Whether a verified change of settings closes, or all but closes, the difference of a pair."""
-    return any(e["closes"] or e["reduction"] >= ENOUGH for e in pair["explained_by"][:1])
+    return any(map(_closes, pair["explained_by"][:1]))
+
+
+def _closes(entry: Mapping[str, Any]) -> bool:
+    return bool(entry["closes"] or entry["reduction"] >= ENOUGH)
 
 
 def _verdict(pairs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -127,8 +131,7 @@ def _standing(name: str, peer: Peer, pairs: Sequence[Mapping[str, Any]]) -> dict
     """Whom one backend agrees with, and which of its own settings separate it from all those with whom it does not."""
     mine = [(p, p["b"] if p["a"] == name else p["a"]) for p in pairs if name in (p["a"], p["b"]) and "refused" not in p]
     apart = [p for p, _ in mine if p["resolved"]]
-    closing = [{e["setting"] for e in p["explained_by"] if e.get("on") == name and (e["closes"] or e["reduction"] >= ENOUGH)}
-               for p in apart]  # fmt: skip
+    closing = [{e["setting"] for e in p["explained_by"] if e.get("on") == name and _closes(e)} for p in apart]
     return {
         "kind": getattr(peer.config, "kind", ""),
         "agrees_with": [other for p, other in mine if not p["resolved"]],

@@ -97,11 +97,11 @@ def sentences(summary: Summary) -> Iterator[str]:
             worst = max(p["max"] for p in summary["pairs"] if p.get("resolved") is False and {p["a"], p["b"]} <= set(group))
             less = "to the last bit" if worst == 0 else f"to {number(worst, 2)}, below the resolution of their arithmetic"
             yield f"{listed(group)} give one answer, {less}."
+    from gapcert_compare import closed
+
     causes: dict[str, list[Summary]] = {}
     for p in apart(summary):
-        named = p["explained_by"][0] if p["explained_by"] else None
-        closing = named is not None and (named["closes"] or named["reduction"] >= 0.99)
-        causes.setdefault(setting_name(named) if closing and named else "", []).append(p)
+        causes.setdefault(setting_name(p["explained_by"][0]) if closed(p) else "", []).append(p)
     for name, pairs in causes.items():
         who, most = _who(pairs, summary["backends"]), share(pairs[0]["relative"])
         if name:
