@@ -225,7 +225,6 @@ def backend() -> str:
         ax.fill_between(names["theta"], -gamma, gamma, color=WITH, alpha=0.18, lw=0, label="±γ, certified")
         ax.plot(names["theta"], gap, color=TRUTH, label="the gap, asked afresh")
         ax.set(xlabel="theta [rad], at rest, without torque", ylabel="gap of theta [rad]", xlim=(-1, 1))
-        ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
 
     picture = draw("backend", "The gap of theta", "The gap of an environment's angle, inside of what is certified.", paint)
     return drawn(picture)
@@ -256,7 +255,6 @@ def envelope() -> str:
         ax.plot(z, truth(data[k]) - cones[:, k], color=FAINT, lw=0.8)
         ax.plot(data, truth(data), "o", color=TRUTH, ms=4)
         ax.set(xlabel="z", ylabel="residual", xlim=(-1.5, 1.5), ylim=(-1.4, 1.6))
-        ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
 
     picture = draw(
         "envelope", "The envelope", "Six samples of a residual, and what they and one constant prove of it everywhere.", paint

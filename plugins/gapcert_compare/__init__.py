@@ -8,7 +8,7 @@ from gapcert.plugin import LazyPackage, homes
 
 _HOME = homes(
     {
-        "gapcert_compare.compare": "Comparison",
+        "gapcert_compare.compare": "Comparison closed",
     }
 )
 

@@ -103,7 +103,11 @@ def _digest(rows: Sequence[Mapping[str, Any]], answers: Mapping[str, str]) -> st
 
 def closed(pair: Mapping[str, Any]) -> bool:
     """Whether a verified change of settings closes, or all but closes, the difference of a pair."""
-    return any(e["closes"] or e["reduction"] >= ENOUGH for e in pair["explained_by"][:1])
+    return any(map(_closes, pair["explained_by"][:1]))
+
+
+def _closes(entry: Mapping[str, Any]) -> bool:
+    return bool(entry["closes"] or entry["reduction"] >= ENOUGH)
 
 
 def _verdict(pairs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -127,8 +131,7 @@ def _standing(name: str, peer: Peer, pairs: Sequence[Mapping[str, Any]]) -> dict
     """Whom one backend agrees with, and which of its own settings separate it from all those with whom it does not."""
     mine = [(p, p["b"] if p["a"] == name else p["a"]) for p in pairs if name in (p["a"], p["b"]) and "refused" not in p]
     apart = [p for p, _ in mine if p["resolved"]]
-    closing = [{e["setting"] for e in p["explained_by"] if e.get("on") == name and (e["closes"] or e["reduction"] >= ENOUGH)}
-               for p in apart]  # fmt: skip
+    closing = [{e["setting"] for e in p["explained_by"] if e.get("on") == name and _closes(e)} for p in apart]
     return {
         "kind": getattr(peer.config, "kind", ""),
         "agrees_with": [other for p, other in mine if not p["resolved"]],
@@ -142,17 +145,14 @@ def _figure(model: Model, laboratory: Laboratory, measured: Sequence[Pair]) -> C
     axes = Axis.all_of(domain.states) + Axis.all_of(domain.inputs)
     drawn = []
     for pair in measured:
-        if "refused" in pair.summary:
+        if pair.at is None:
             continue
         values = np.empty((0, 0)) if pair.slice is None else pair.slice
         shown = map_axes(laboratory) if pair.slice is not None else ()
-        held = [f"{a.name} = {v:.3g} {a.unit}" for k, (a, v) in enumerate(zip(axes, _at(pair), strict=True)) if k not in shown]
+        at = enumerate(zip(axes, pair.at.tolist(), strict=True))
+        held = [f"{a.name} = {v:.3g} {a.unit}" for k, (a, v) in at if k not in shown]
         unit = axes[pair.state].unit
         drift = np.empty(0) if pair.drift is None else pair.drift
         names = pair.summary["a"], pair.summary["b"], pair.summary["state"], unit
         drawn.append(PairFigure(*names, tuple(axes[k] for k in shown), ", ".join(held), values, drift))
     return CompareFigure(model.period, tuple(drawn))
-
-
-def _at(pair: Pair) -> list[float]:
-    return [] if pair.at is None else pair.at.tolist()

@@ -25,7 +25,6 @@ Summary = Mapping[str, Any]
 MOST = 2  # pictures: a cell's output is read in passing
 ROWS = 12  # of a table; more are counted
 _SPENT = {"lipschitz": "constants", "symmetry": "the check of the symmetry"}
-_MARKS = {"good": "✓", "bad": "✗", "open": "?"}
 _STYLE = """
 .gapcert { --ink: currentColor; --truth: currentColor; --card: transparent; --faint: #808891; --line: #80889155;
   --with: #3b7fdb; --without: #cc6c12; --bad: #d8404f; --good: #1f9058; --open: #ad7d12;
@@ -67,7 +66,7 @@ def _apart(svg: str) -> Html:
 
 
 def _verdict(word: str, kind: str) -> Html:
-    return h("p", f"{_MARKS[kind]} {word}", class_="verdict")
+    return h("p", f"{words.MARKS[kind]} {word}", class_="verdict")
 
 
 def certificate_html(c: Summary, pictures: Sequence[Picture] = ()) -> str:

@@ -9,8 +9,9 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from gapcert import Array
+from gapcert_figures import Axis
 
-from .plane import Seen
+from .plane import Plane, Seen
 
 TIME = "time"
 """Seconds of a motion."""
@@ -27,6 +28,12 @@ class Canvas:
     def show(self, group: str, name: str, one: rrb.View | Seen) -> None:
         """A view of this group; one of that name is replaced."""
         self.views.setdefault(group, {})[name] = one
+
+    def plane(self, root: str, x: Axis, y: Axis, title: str = "") -> Plane:
+        """Two axes, with their frame."""
+        plane = Plane(x, y)
+        self.static(f"{root}/frame", *plane.frame(title))
+        return plane
 
     def static(self, path: str, *what: Any) -> None:
         for one in what:

@@ -8,7 +8,7 @@ from gapcert import Array
 from gapcert_figures import CompareFigure
 
 from .canvas import Canvas
-from .plane import GOOD, WITHOUT, Plane, Seen, series
+from .plane import GOOD, WITHOUT, Seen, series
 
 
 def draw_comparison(canvas: Canvas, comparison: CompareFigure) -> None:
@@ -18,9 +18,8 @@ def draw_comparison(canvas: Canvas, comparison: CompareFigure) -> None:
         name = f"{p.a} against {p.b}"
         if p.values.size:
             root, top = f"pair/{p.a}-{p.b}", float(np.nanmax(p.values))
-            plane = Plane(p.axes[0], p.axes[1])
+            plane = canvas.plane(root, p.axes[0], p.axes[1], f"one step of {p.state} differs by")
             canvas.static(f"{root}/map", plane.heat(p.values, top))
-            canvas.static(f"{root}/frame", *plane.frame(f"one step of {p.state} differs by"))
             canvas.static(f"{root}/scale", *plane.scale(top, p.unit))
             canvas.show("pair", root, Seen(root, f"{name}{f', {p.fixed}' if p.fixed else ''}", bar=True))
         if p.drift.size:

@@ -17,20 +17,17 @@ from .robot import as_path, draw_robot
 
 def draw_winning(canvas: Canvas, w: WinningFigure) -> None:
     """Where both controllers win, or one alone; the goal; and how long it takes."""
-    plane = Plane(w.axes[0], w.axes[1])
+    plane = canvas.plane("winning", w.axes[0], w.axes[1])
     for role, _, mask in w.areas:
         # Darker than the runs that lie upon it.
         red, green, blue = (c * 2 // 5 for c in ROLES[role][:3])
         canvas.static(f"winning/{role}", plane.mask(mask, (red, green, blue, 255)))
-    canvas.static("winning/frame", *plane.frame(""))
-    first, second = (
-        f"{n} {100 * grid.mean():.3g} %" for n, grid in zip(w.labels, (w.with_gamma, w.without_gamma), strict=True)
-    )
-    roots = {"winning": f"May start: {first}, {second}{held(w.fixed)}"}
+    both = zip(w.labels, (w.with_gamma, w.without_gamma), strict=True)
+    shares = ", ".join(f"{name} {100 * grid.mean():.3g} %" for name, grid in both)
+    roots = {"winning": f"May start: {shares}{held(w.fixed)}"}
     if w.values.size:
         roots["promise"], top = f"Steps that are promised{held(w.fixed)}", float(np.nanmax(w.values))
-        canvas.static("promise/steps", plane.heat(w.values, top))
-        canvas.static("promise/frame", *plane.frame(""))
+        canvas.static("promise/steps", canvas.plane("promise", plane.x, plane.y).heat(w.values, top))
         canvas.static("promise/scale", *plane.scale(top, "steps"))
     for root, title in roots.items():
         for k, o in enumerate(o for o in w.outlines if o.cut):
@@ -89,7 +86,7 @@ def _runs(canvas: Canvas, loop: LoopFigure, runs: Runs) -> None:
     if len(runs.traces):
         _now(canvas, f"winning/runs/{name}/now", plane, runs.traces[0], t, colour)
     if "winning" not in canvas.views:
-        canvas.static("winning/frame", *plane.frame(""))
+        canvas.plane("winning", plane.x, plane.y)
         canvas.show("winning", "winning", Seen("winning", "Runs over the first two states"))
 
 

@@ -12,7 +12,7 @@ from gapcert import Array
 from gapcert_figures import Axis, DiagnosisFigure
 
 from .canvas import Canvas
-from .plane import FAINT, ROLES, TRUTH, WITH, Plane, Seen, series
+from .plane import FAINT, ROLES, TRUTH, WITH, Seen, series
 from .robot import draw_robot
 
 BOTH = ("before", "after")
@@ -61,12 +61,11 @@ def _law(canvas: Canvas, root: str, law: Any) -> None:
     every = np.concatenate([law.y - half, law.y + half, law.law, [0.0]])
     low, high = float(np.nanmin(every)), float(np.nanmax(every))
     across = np.concatenate([law.x, law.at])
-    plane = Plane(_axis(law.x_label, np.nanmin(across), np.nanmax(across)), _axis(law.y_label, low, high))
+    plane = canvas.plane(root, _axis(law.x_label, np.nanmin(across), np.nanmax(across)), _axis(law.y_label, low, high))
 
     def at(x: Array, y: Array, height: float = 0.01) -> Array:
         return plane.at(np.column_stack([x, y]), height)
 
-    canvas.static(f"{root}/frame", *plane.frame(""))
     canvas.static(f"{root}/zero", *plane.zero())
     ends = [at(np.array([x, x]), np.array([y - h, y + h])) for x, y, h in zip(law.x, law.y, half, strict=True)]
     canvas.static(f"{root}/interval", rr.LineStrips3D(ends, radii=0.002, colors=[FAINT] * len(ends)))
@@ -102,8 +101,7 @@ def _correlation(canvas: Canvas, c: Any) -> None:
     if len(c.lag) < 2:
         return
     root = f"left/{c.channel}-{c.against}"
-    plane = Plane(Axis("lag", "s", float(c.lag[0]), float(c.lag[-1])), Axis("correlation", "", -1.05, 1.05))
-    canvas.static(f"{root}/frame", *plane.frame(""))
+    plane = canvas.plane(root, Axis("lag", "s", float(c.lag[0]), float(c.lag[-1])), Axis("correlation", "", -1.05, 1.05))
     band = np.full_like(c.lag, c.band)
     canvas.static(f"{root}/chance", plane.ribbon(c.lag, -band, band, (60, 64, 72, 255), 0.005))
     for name in BOTH:
@@ -116,8 +114,7 @@ def _correlation(canvas: Canvas, c: Any) -> None:
 def _course(canvas: Canvas, root: str, course: Any, title: str) -> None:
     top = 1.1 * float(max(course.before.max(), 1.5))
     span = Axis("time", "s", float(course.t[0]), float(course.t[-1]) if len(course.t) > 1 else float(course.t[0]) + 1.0)
-    plane = Plane(span, Axis("RMS", "noise floors", 0.0, top))
-    canvas.static(f"{root}/frame", *plane.frame(""))
+    plane = canvas.plane(root, span, Axis("RMS", "noise floors", 0.0, top))
     canvas.static(f"{root}/floor", plane.curve(course.t, np.ones_like(course.t), FAINT, 0.0015))
     for name in BOTH:
         canvas.static(f"{root}/{name}", plane.curve(course.t, getattr(course, name), ROLES[name]))

@@ -36,8 +36,7 @@ def draw_gap(canvas: Canvas, gap: GapFigure) -> None:
 
 def _band(canvas: Canvas, path: str, b: Band) -> None:
     reach = 1.15 * max(b.constant, float(b.gamma.max()))
-    plane = Plane(b.axis, Axis(f"gap of {b.state}", b.unit, -reach, reach))
-    canvas.static(f"{path}/frame", *plane.frame(""))
+    plane = canvas.plane(path, b.axis, Axis(f"gap of {b.state}", b.unit, -reach, reach))
     canvas.static(f"{path}/gamma", plane.ribbon(b.at, -b.gamma, b.gamma, _REACH, 0.005))
     canvas.static(f"{path}/envelope", plane.ribbon(b.at, b.low, b.high, _TUBE))
     for side, sign in (("low", -1), ("high", 1)):
@@ -51,9 +50,9 @@ def draw_recorded(canvas: Canvas, f: RecordedFigure) -> None:
     n = len(f.scores)
     low, high = min(0.0, float(f.scores.min())), float(f.scores.max())
     pad = 0.05 * (high - low) or 1.0
-    plane = Plane(Axis("held window, from the best to the worst", "", 0, n + 1), Axis("score", "", low - pad, high + pad))
+    windows, score = Axis("held window, from the best to the worst", "", 0, n + 1), Axis("score", "", low - pad, high + pad)
+    plane = canvas.plane("scores", windows, score, f"rank {f.rank} of {n} sets the band")
     place = np.column_stack([np.arange(1, n + 1), f.scores])
-    canvas.static("scores/frame", *plane.frame(f"rank {f.rank} of {n} sets the band"))
     canvas.static("scores/zero", *plane.zero())
     canvas.static("scores/windows", rr.Points3D(plane.at(place), radii=0.005, colors=[WITH]))
     canvas.static("scores/rank", rr.Points3D(plane.at(place[f.rank - 1 : f.rank], 0.03), radii=0.014, colors=[GOOD]))

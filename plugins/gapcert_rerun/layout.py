@@ -67,7 +67,7 @@ def blueprint(canvas: Canvas, *, over: bool) -> rrb.Blueprint:
         left += views.get("stages", {}).values()
     parts: list[Any] = [rrb.Vertical(*left, row_shares=[4, 1][: len(left)])] if left else []
     if rows:
-        heights = [_height(row) for row in rows]
+        heights = [0.8 if set(row) <= set(_ROWS[2]) else 1.0 for row in rows]
         packed = [_row(row, views, h / sum(heights)) for row, h in zip(rows, heights, strict=True)]
         parts.append(rrb.Vertical(*packed, row_shares=heights))
     body = rrb.Horizontal(*parts, column_shares=[1, 3][-len(parts) :])
@@ -81,7 +81,7 @@ def blueprint(canvas: Canvas, *, over: bool) -> rrb.Blueprint:
 
 def _row(names: Sequence[str], views: Views, height: float) -> Any:
     """Cells side by side; height: the row's share of the window."""
-    widths = [_width(name) for name in names]
+    widths = [{"gap": 1.9, "explained": 0.8}.get(name, 1.0) for name in names]
     tall = height * _HIGH - _TITLE
     cells = [_cell(name, views[name], _WIDE * w / sum(widths) / tall) for name, w in zip(names, widths, strict=True)]
     return rrb.Horizontal(*cells, column_shares=widths)
@@ -98,11 +98,3 @@ def _cell(name: str, views: Mapping[str, Any], aspect: float) -> Any:
         return rrb.Horizontal(*every)
     stacks = name in _OVER_TIME and len(every) <= (2 if name == "robot" else _STACKED)
     return rrb.Vertical(*every) if stacks else rrb.Tabs(*every)
-
-
-def _width(name: str) -> float:
-    return {"gap": 1.9, "explained": 0.8}.get(name, 1.0)
-
-
-def _height(row: Sequence[str]) -> float:
-    return 0.8 if set(row) <= set(_ROWS[2]) else 1.0

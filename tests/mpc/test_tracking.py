@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from gapcert_mpc.tracking import Course
 
 from gapcert import UsageError, closed_loop
 from gapcert_cells.testing import Band, Rod, rod_problem, rod_reach_avoid

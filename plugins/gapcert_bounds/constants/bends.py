@@ -12,10 +12,10 @@ import numpy.typing as npt
 from gapcert import Array, UsageError
 from gapcert.plugin import LipschitzProblem
 
+from .slopes import around
+
 _ROUNDS = 6
 _FRESH = 0.25  # share of a later round that is drawn from all of Z
-_ELITES = 8  # per state
-_WIDE = 0.3  # of the domain's width: how far around an elite the second round looks; half as far in each later one
 _SURE = 0.02  # share of the largest second difference that the resolution may fake at a shortened distance
 _CLEAR = 16.0  # second differences below so many resolutions tell nothing
 _STEPS = 4  # of the sweep, by four each
@@ -36,9 +36,7 @@ class Bends:
 
     @classmethod
     def ask(cls, problem: LipschitzProblem, name: str, axis: int, centre: Array, step: Array) -> Bends:
-        low, high = centre.copy(), centre.copy()
-        low[:, axis] -= step
-        high[:, axis] += step
+        low, high = _beside(centre, step, axis)
         # Rounding z ∓ δ shifts g by up to L ulp(z), which is of the order of its resolution or below.
         before, here, after = np.split(problem.remainder(name, np.concatenate([low, centre, high])), 3)
         return cls(centre, step, np.abs(before - 2 * here + after))
@@ -126,10 +124,15 @@ def _random(problem: LipschitzProblem, j: int, rng: np.random.Generator, count: 
     )
 
 
-def _room(problem: LipschitzProblem, z: Array, step: Array, j: int) -> npt.NDArray[np.bool_]:
+def _beside(z: Array, step: Array, j: int) -> tuple[Array, Array]:
     low, high = z.copy(), z.copy()
     low[:, j] -= step
     high[:, j] += step
+    return low, high
+
+
+def _room(problem: LipschitzProblem, z: Array, step: Array, j: int) -> npt.NDArray[np.bool_]:
+    low, high = _beside(z, step, j)
     return np.asarray(problem.domain.contains(z) & problem.domain.contains(low) & problem.domain.contains(high))
 
 
@@ -137,16 +140,12 @@ def _around(
     problem: LipschitzProblem, j: int, rng: np.random.Generator, found: Bends, noise: Array, most: int, longest: float, k: int
 ) -> tuple[Array, Array]:
     """Up to `most` centres and steps around each state's largest second differences."""
-    domain, size = problem.domain, _sure(found, noise)
-    state = np.arange(most) % domain.nx
-    order = np.argsort(-size, axis=0, kind="stable")[:_ELITES]
-    middle = found.centre[order[rng.integers(len(order), size=most), state]]
-    wide = _WIDE * 0.5 ** (k - 1) * domain.width
-    z = domain.reach(middle, np.clip(middle + wide * rng.standard_normal(middle.shape), domain.low, domain.high))
+    size = _sure(found, noise)
+    state, z = around(problem, rng, found.centre, size, most, k)
     needed = np.sqrt(noise / (_SURE * np.maximum(size.max(axis=0), np.finfo(float).tiny)))
     step = np.clip(np.maximum(needed[state], longest * 0.5**k), None, longest)
     # At the faces of Z the triple is moved inside, so that what is largest there is met as well.
-    low, high = domain.chord(z, j)
+    low, high = problem.domain.chord(z, j)
     z[:, j] = np.clip(z[:, j], low + step, np.maximum(high - step, low + step))
     rows = _room(problem, z, step, j)
     return z[rows], step[rows]

@@ -10,14 +10,12 @@ from gapcert import Array, UsageError
 from gapcert.plugin import LipschitzBound, LipschitzEstimator, LipschitzProblem
 
 from .bends import curvatures
-from .slopes import NOISE, Close, inert, uniform
+from .slopes import NOISE, Close, around, inert, uniform
 from .sweep import Curvature, estimate
 
 _ROUNDS = 8
 _FIRST = 2  # parts of the pairs that the first round has, of which each later one has one
 _FRESH = 0.25  # share of a later round that is drawn from all of Z
-_ELITES = 8  # per state and axis
-_WIDE = 0.3  # of the domain's width: how far around an elite the second round looks; half as far in each later one
 _SHORTEST = 1 / 16  # of the distance
 _SURE = 0.02  # share of the largest slope that the resolution may fake at a shortened pair
 
@@ -99,13 +97,8 @@ class GradientElite(LipschitzEstimator):
         k: int,
     ) -> tuple[Array, Array]:
         """Both ends of up to `most` pairs around each state's elites, one-sided steps within Z."""
-        domain, nx = problem.domain, problem.domain.nx
-        state = np.arange(most) % nx
-        order = np.argsort(-slope, axis=0, kind="stable")[:_ELITES]
-        elite = order[rng.integers(len(order), size=most), state]
-        width = _WIDE * 0.5 ** (k - 1) * domain.width
-        middle = (close.start[elite] + close.end[elite]) / 2
-        z = domain.reach(middle, np.clip(middle + width * rng.standard_normal(middle.shape), domain.low, domain.high))
+        domain = problem.domain
+        state, z = around(problem, rng, (close.start + close.end) / 2, slope, most, k)
         longest = self.distance * domain.width[j]
         needed = noise / (_SURE * np.maximum(slope.max(axis=0), np.finfo(float).tiny))
         step = np.clip(np.maximum(needed[state], longest * max(_SHORTEST, 0.5**k)), None, longest)

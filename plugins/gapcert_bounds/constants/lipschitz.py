@@ -38,13 +38,12 @@ class Declared(LipschitzEstimator):
     def bound(self, problem: LipschitzProblem) -> LipschitzBound:
         axes = [a.name for a in problem.domain.axes]
         states = axes[: problem.domain.nx]
-        value = _table(self.values, states, axes, "lipschitz.values")
+        value = np.array(_table(self.values, states, axes, "lipschitz.values"), dtype=np.float64)
         if self.curvature is None:
             return LipschitzBound(value, np.zeros_like(value), "declared", "declared")
-        rows = named(self.curvature, states, "lipschitz.curvature", "state")
-        columns = [list(named(rows[s], axes, f"lipschitz.curvature.{s}", "axis").values()) for s in states]
+        rows = _table(self.curvature, states, axes, "lipschitz.curvature")
         ends = zip(problem.domain.low, problem.domain.high, axes, strict=True)
-        slabs = tuple(_slabs([row[j] for row in columns], *end) for j, end in enumerate(ends))
+        slabs = tuple(_slabs([row[j] for row in rows], *end) for j, end in enumerate(ends))
         bent = np.stack([h.max(axis=1) for _, h in slabs], axis=1)
         several = tuple(slab if len(slab[0]) > 2 else None for slab in slabs)
         return LipschitzBound(value, np.zeros_like(value), "declared", "declared", curvature=bent, slabs=several)
@@ -65,9 +64,9 @@ def _slabs(given: list[Bend], low: float, high: float, axis: str) -> tuple[Array
     return cuts, np.array([[next(h for a, b, h in part if a <= m <= b) for m in middle] for part in parts])
 
 
-def _table(given: Mapping[str, Mapping[str, float]], states: list[str], axes: list[str], where: str) -> Array:
+def _table(given: Mapping[str, Mapping[str, T]], states: list[str], axes: list[str], where: str) -> list[list[T]]:
     rows = named(given, states, where, "state")
-    return np.array([list(named(row, axes, f"{where}.{s}", "axis").values()) for s, row in rows.items()], dtype=np.float64)
+    return [list(named(row, axes, f"{where}.{s}", "axis").values()) for s, row in rows.items()]
 
 
 def named(given: Mapping[str, T], names: list[str], where: str, what: str) -> dict[str, T]:

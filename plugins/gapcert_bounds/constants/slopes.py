@@ -12,6 +12,8 @@ from gapcert import Array, UsageError
 from gapcert.plugin import LipschitzProblem
 
 NOISE = 0.1  # share of the largest slope that the resolution may fake
+_ELITES = 8  # per state and axis
+_WIDE = 0.3  # of the domain's width: how far around an elite the second round looks; half as far in each later one
 
 
 @final
@@ -90,6 +92,18 @@ def _chords(
         f"lipschitz {method}: {found} of {100 * count} points of the domain have room for a pair along "
         f"'{domain.axes[j].name}' within the relations; give a smaller distance"
     )
+
+
+def around(
+    problem: LipschitzProblem, rng: np.random.Generator, middles: Array, size: Array, most: int, k: int
+) -> tuple[npt.NDArray[np.intp], Array]:
+    """(states (n,), points of Z (n, nz)) around the middles (m, nz) where a state's size (m, nx) is largest, in round k."""
+    domain = problem.domain
+    state = np.arange(most) % domain.nx
+    order = np.argsort(-size, axis=0, kind="stable")[:_ELITES]
+    middle = middles[order[rng.integers(len(order), size=most), state]]
+    wide = _WIDE * 0.5 ** (k - 1) * domain.width
+    return state, domain.reach(middle, np.clip(middle + wide * rng.standard_normal(middle.shape), domain.low, domain.high))
 
 
 def inert(problem: LipschitzProblem, j: int, pairs: Close, seen: Array, noise: Array, method: str) -> npt.NDArray[np.bool_]:

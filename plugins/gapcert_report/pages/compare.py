@@ -8,7 +8,7 @@ from typing import Any
 from gapcert_figures import Figures
 from gapcert_report.pictures import compare as pictures
 from gapcert_report.pictures.svg import Picture
-from gapcert_report.words.compare import apart, groups, made, sentences, setting_name, share
+from gapcert_report.words.compare import apart, groups, made, setting_name, share
 from gapcert_report.words.words import number
 
 from .html import Html, h, section, table
@@ -16,11 +16,6 @@ from .html import Html, h, section, table
 Summary = Mapping[str, Any]
 OPEN = 3
 """Pairs whose pictures are seen at once; those of the others are folded."""
-
-
-def answer(summary: Summary) -> list[Html]:
-    """What was found, one sentence per group of simulators and per cause."""
-    return [h("p", text) for text in sentences(summary)]
 
 
 def tiles(summary: Summary) -> list[tuple[str, str, str, str]]:

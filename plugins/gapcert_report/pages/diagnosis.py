@@ -70,7 +70,7 @@ def why_wrong(summary: Summary, album: DiagnosisAlbum, folder: Path, winning: Se
     parts = [
         h("h2", "Is it wrong?" if summary["verdict"] == "nothing" else "Why is it wrong?"),
         said(sentence(summary) if "certificate" in summary else None),  # else the page begins with it
-        _warned(summary),
+        *(h("p", f"Warning: {w}.", class_="bad") for w in summary.get("warnings", ())),
         _causes(summary),
         _refitted(summary),
         gallery(album.laws),
@@ -132,17 +132,13 @@ def _rivals(summary: Summary) -> Html | None:
     return part("Rivals", table("The best of what was fitted in place of each cause", head, rows, 2), below)
 
 
-def _of(summary: Summary) -> str:
-    return f"of {summary['seconds']:.3g} s " if "seconds" in summary else ""
-
-
 def _ambiguous(summary: Summary) -> Html | None:
-    groups = summary.get("ambiguous_with", ())
-    parts: list[Html | None] = []
+    groups, parts = summary.get("ambiguous_with", ()), list[Html | None]()
+    long = f"of {summary['seconds']:.3g} s " if "seconds" in summary else ""
     if groups:
         rest = h("ul", *(h("li", words.listed([cause_name(c) for c in group])) for group in groups))
         text = "These explain the recording as well" + (
-            f"; no input {_of(summary)}within the limits tells them apart, and the simplest was named:"
+            f"; no input {long}within the limits tells them apart, and the simplest was named:"
             if summary["verdict"] == "causes"
             else ":"
         )
@@ -246,10 +242,6 @@ def _unexplained(rest: Summary | None) -> Html | None:
         caption = f"A correction from data alone at {law['site']}, not a cause; {known}"
         parts.append(table(caption, ("term", "coefficient"), terms))
     return join(parts)
-
-
-def _warned(summary: Summary) -> Html:
-    return join([h("p", f"Warning: {w}.", class_="bad") for w in summary.get("warnings", ())])
 
 
 def _assumed(summary: Summary) -> Html | None:

@@ -27,12 +27,3 @@ def packed(values: Array) -> dict[str, Any]:
         return {"runs": [[None if np.isnan(v) else int(v), c] for v, c in zip(values[starts], counts, strict=True)]}
     offset = float(known[0]) if top > 100 * wide else 0.0
     return {"offset": offset, "f32": base64.b64encode((values - offset).astype("<f4").tobytes()).decode()}
-
-
-def unpacked(data: dict[str, Any]) -> Array:
-    """The array that `packed` was given, to seven digits."""
-    if "n" in data:
-        return np.asarray(data["first"] + data["step"] * np.arange(data["n"]))
-    if "runs" in data:
-        return np.concatenate([np.full(c, np.nan if v is None else v) for v, c in data["runs"]])
-    return np.asarray(np.frombuffer(base64.b64decode(data["f32"]), "<f4").astype(float) + data["offset"])

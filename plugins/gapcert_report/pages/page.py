@@ -15,6 +15,7 @@ from gapcert_closed_loop import broken_sentence
 from gapcert_figures import Figures
 from gapcert_report.pictures.album import Album, album_of
 from gapcert_report.words import words
+from gapcert_report.words.compare import sentences
 from gapcert_report.words.diagnosis import cause_name, sentence, whole
 from gapcert_report.words.words import number
 
@@ -22,7 +23,6 @@ from . import compare, diagnosis
 from .html import Html, document, folded, framed, gallery, h, join, listing, part, said, section, table
 
 Summary = Mapping[str, Any]
-_MARKS = {"good": "✓", "bad": "✗", "open": "?"}
 _STATE_COLUMNS = {
     "gap_mean": "mean gap",
     "gamma_mean": "mean γ",
@@ -49,13 +49,13 @@ _QUANTITIES = {
 def mark(good: bool | None) -> Html:
     """A verdict in a table cell: sign and word, never colour alone."""
     kind, word = ("good", "yes") if good else ("open", "not decided") if good is None else ("bad", "no")
-    return h("b", f"{_MARKS[kind]} {word}", class_=kind)
+    return h("b", f"{words.MARKS[kind]} {word}", class_=kind)
 
 
 def answer(summary: Summary) -> Html:
     """Verdict, and the sentence that the claim allows."""
     word, kind, meaning = words.verdict(summary)
-    parts = [h("p", f"{_MARKS[kind]} {word}", class_="verdict")]
+    parts = [h("p", f"{words.MARKS[kind]} {word}", class_="verdict")]
     if "certificate" in summary:
         c = summary["certificate"]
         refuted = words.refutation(c) is not None
@@ -64,12 +64,12 @@ def answer(summary: Summary) -> Html:
     elif "causes" in summary:
         parts.append(h("p", whole(sentence(summary))))
     elif "pairs" in summary:
-        parts += compare.answer(summary)
+        parts += [h("p", text) for text in sentences(summary)]
     if summary["verdict"] in ("fails", "unknown") or len(parts) == 1:
         parts.append(h("p", summary.get("reason") or meaning))
     if unmet := [e for e in summary.get("expectations", ()) if not e["met"]]:
         which = words.some([f"{e['text']} (found {_value(e['value'])})" for e in unmet], 3)
-        parts.append(h("p", h("b", f"{_MARKS['bad']} Not as the spec expects", class_="bad"), f": {which}."))
+        parts.append(h("p", h("b", f"{words.MARKS['bad']} Not as the spec expects", class_="bad"), f": {which}."))
     if "certificate" in summary:
         parts.append(h("p", words.symbols(summary["certificate"]), class_="symbols"))
     return h("section", *parts, class_=f"answer {kind}", aria_label="Answer")
@@ -111,7 +111,7 @@ def expectations(summary: Summary) -> Html | None:
     rows = [(e["text"], _value(e["value"]), mark(e["met"])) for e in found]
     met = sum(bool(e["met"]) for e in found)
     shown = table("What the spec expects, and what was found", ("expected", "found", "met"), rows, 3)
-    told = f"{_MARKS['good' if met == len(rows) else 'bad']} {met} of {len(rows)} that the spec states are met"
+    told = f"{words.MARKS['good' if met == len(rows) else 'bad']} {met} of {len(rows)} that the spec states are met"
     if met == len(rows):
         return section("Expectations", folded(told, shown))
     return section("Expectations", h("p", f"{told}.", class_="bad"), shown)

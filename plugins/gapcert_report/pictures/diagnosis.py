@@ -78,8 +78,8 @@ def error_picture(i: int, c: Channel) -> Picture:
 
 def law_picture(i: int, law: Law) -> Picture:
     """What is missing, estimated interval by interval, with the law that was named."""
-    unit, label = scaled(_unit(law.y_label), law.y, law.law, law.half[np.isfinite(law.half)])
-    what = law.y_label.split(" [")[0]
+    what, _, own = law.y_label.partition(" [")
+    unit, label = scaled(own.removesuffix("]"), law.y, law.law, law.half[np.isfinite(law.half)])
 
     def on(ax: Axes) -> None:
         ax.axhline(0, color=FAINT, lw=0.8)
@@ -108,10 +108,6 @@ def _branches(law: Law) -> list[tuple[str, Any, str]]:
     if not law.rising.size:
         return [("o", slice(None), "from the data")]
     return [("^", law.rising > 0, "data, rising"), ("v", law.rising == 0, "data, falling")]
-
-
-def _unit(label: str) -> str:
-    return label[label.index("[") + 1 : -1]
 
 
 def waterfall_picture(w: Waterfall) -> Picture:

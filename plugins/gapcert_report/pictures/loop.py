@@ -119,8 +119,11 @@ def foresight_pictures(loop: LoopFigure, winning: WinningFigure | None) -> list[
     if not loop.foreseen:
         return []
     ahead = [] if loop.ahead is None else [_one_step(loop, loop.ahead)]
-    over_time = [*ahead, _over_time(loop, _widest(loop))]
-    return over_time if winning is None or _thin(loop) else [*over_time, _in_the_plane(loop, winning)]
+    widths = _widths(loop)
+    # Of the state whose tube is widest, as a share of where it may be.
+    over_time = [*ahead, _over_time(loop, int(np.argmax(widths / np.ptp(loop.stay, axis=1))))]
+    thin = (widths[:2] < SEEN * np.ptp(_trace(loop)[:, :2], axis=0)).all()  # too small to be seen beside the run
+    return over_time if winning is None or thin else [*over_time, _in_the_plane(loop, winning)]
 
 
 def _trace(loop: LoopFigure) -> Array:
@@ -133,16 +136,6 @@ def _trace(loop: LoopFigure) -> Array:
 def _widths(loop: LoopFigure) -> Array:
     """(nx,): the widest box of all tubes."""
     return np.asarray(np.stack([(f.high - f.low).max(axis=0) for f in loop.foreseen]).max(axis=0))
-
-
-def _widest(loop: LoopFigure) -> int:
-    """The state whose tube is widest, as a share of where it may be."""
-    return int(np.argmax(_widths(loop) / np.ptp(loop.stay, axis=1)))
-
-
-def _thin(loop: LoopFigure) -> bool:
-    """Are the boxes too small to be seen beside the run, over the first two states?"""
-    return bool((_widths(loop)[:2] < SEEN * np.ptp(_trace(loop)[:, :2], axis=0)).all())
 
 
 def _one_step(loop: LoopFigure, ahead: Ahead) -> Picture:

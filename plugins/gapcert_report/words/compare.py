@@ -97,11 +97,11 @@ def sentences(summary: Summary) -> Iterator[str]:
             worst = max(p["max"] for p in summary["pairs"] if p.get("resolved") is False and {p["a"], p["b"]} <= set(group))
             less = "to the last bit" if worst == 0 else f"to {number(worst, 2)}, below the resolution of their arithmetic"
             yield f"{listed(group)} give one answer, {less}."
+    from gapcert_compare import closed
+
     causes: dict[str, list[Summary]] = {}
     for p in apart(summary):
-        named = p["explained_by"][0] if p["explained_by"] else None
-        closing = named is not None and (named["closes"] or named["reduction"] >= 0.99)
-        causes.setdefault(setting_name(named) if closing and named else "", []).append(p)
+        causes.setdefault(setting_name(p["explained_by"][0]) if closed(p) else "", []).append(p)
     for name, pairs in causes.items():
         who, most = _who(pairs, summary["backends"]), share(pairs[0]["relative"])
         if name:
@@ -110,15 +110,12 @@ def sentences(summary: Summary) -> Iterator[str]:
             yield f"{who}, on average by up to {most} of what one step moves, and no setting that was tried closes it."
     for name in coarse(summary):
         friends = summary["backends"][name]["agrees_with"]
-        least = min(_resolution(p) for p in summary["pairs"] if name in (p["a"], p["b"]) and p.get("resolved") is False)
+        own = (p["states"].values() for p in summary["pairs"] if name in (p["a"], p["b"]) and p.get("resolved") is False)
+        least = min(max(float(s["resolution"]) for s in states) for states in own)
         yield (
             f"{name} cannot be told from {listed(friends)}, which differ: what its own solver may leave undone, up to "
             f"{number(least, 2)} a step, is more than lies between them."
         )
-
-
-def _resolution(pair: Summary) -> float:
-    return max(float(s["resolution"]) for s in pair["states"].values())
 
 
 def _closed(name: str, entry: Summary) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 
 from gapcert.plugin import outside, pretty, times
 
+MARKS = {"good": "✓", "bad": "✗", "open": "?"}
 MANY = 3  # states of which each is named; of more there is a range
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
