@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from gapcert_mpc.tracking import Course
 
 from gapcert import UsageError, closed_loop
 from gapcert_cells.testing import Band, Rod, rod_problem, rod_reach_avoid
