@@ -63,7 +63,7 @@ def diagnose(
     clock = Clock(emit)
     _timed(model, recording, horizons)
     parts, more = recording.split(hold_out or {"last": 0.25}, train), experiment or {}
-    problem = DiagnosisProblem(model, recording, *parts, _effects(effects), horizons, window, more, seed, emit, folder, clock)
+    problem = DiagnosisProblem(model, recording, *parts, _effects(effects), horizons, window, more, seed, folder, clock)
     others = (c.load()() for c in registry().of("diagnoser") if c.missing() is None)
     answer = next((d.diagnose for d in others if d.accepts(model)), _searched)
     return replace(answer(problem), timings=clock.laps)
@@ -144,7 +144,7 @@ class _Data:
         library = Library(model, Dataset.of(model, problem.fitted), problem.effects)
         fitted = library.measured
         held = replace(Dataset.of(model, with_past), sigma=fitted.sigma, spread=fitted.spread, since=since)
-        _warned(problem.emit, fitted, held)
+        _warned(problem.clock.emit, fitted, held)
         assumed = kept_within(model, fitted, held)
         data = cls(library, fitted.windows(_length(fitted, model, problem.window)).thinned(ENOUGH, GUARDED), held, assumed)
         data.stretches(problem.horizons)  # refuses before the search is paid for

@@ -56,7 +56,6 @@ class DiagnosisProblem:
     window: float | None
     experiment: Mapping[str, Any]
     seed: int
-    emit: Emit
     folder: Path | None
     clock: Clock
 

@@ -149,10 +149,9 @@ class Dataset:
             first, last = self.first(i), len(y) - length
             count = max(0, (len(y) - first) // length)
             starts = first + length * np.arange(count) if stride is None else np.arange(first, last + 1, stride)
-            seen = [self.weights[i][s : s + length].mean(axis=0) for s in starts]
-            parts += [
-                (i, int(s)) for s, share in zip(starts, seen, strict=True) if share.mean() >= SEEN and share.min() >= SEEN / 2
-            ]
+            for s in starts.tolist():
+                share = self.weights[i][s : s + length].mean(axis=0)
+                parts += [(i, s)] if share.mean() >= SEEN and share.min() >= SEEN / 2 else []
         if not parts:
             longest = max(map(len, self.outputs)) * self.period
             need, before, window = ((n * self.period) for n in (length + self.history, self.history, length))
@@ -164,10 +163,10 @@ class Dataset:
                     f"where channels come at different rates, add the period of the slowest to the recording, "
                     f"every: {slowest:.3g} s"
                 )
-            found = f"the longest stretch is {longest:.3g} s"
             raise UsageError(
-                f"recording: {found}; expected a window of {window:.3g} s after {before:.3g} s of history; record for "
-                "longer, or, where its time is not in s, give the unit of that column, recording.units: {TIME: min}"
+                f"recording: the longest stretch is {longest:.3g} s; expected a window of {window:.3g} s after {before:.3g} s "
+                "of history; record for longer, or, where its time is not in s, give the unit of that column, "
+                "recording.units: {TIME: min}"
             )
         return self.at(np.array(parts), length)
 

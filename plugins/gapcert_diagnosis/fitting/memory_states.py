@@ -23,10 +23,7 @@ def recalled(model: Model, windows: Windows, parameters: Mapping[str, Array | fl
 
     A lag, a play or a sagging supply knows more of the past than the history before a window tells.
     """
-    out = np.tile(model.hidden_default, (count, len(windows), 1))
-    names = [s.name for s in model.hidden]
-    if "time" in names:
-        out[:, :, names.index("time")] = windows.t - windows.measured.history * windows.measured.period
+    out = _defaults(model, count, windows.t - windows.measured.history * windows.measured.period)
     if model.remembers:
         if windows not in _WAYS:
             first = windows.place[:, 1] - windows.measured.history
@@ -35,6 +32,15 @@ def recalled(model: Model, windows: Windows, parameters: Mapping[str, Array | fl
         for piece, hidden in _Past(model, _WAYS[windows], parameters, count).found().items():
             out[:, _WAYS[windows].rows[piece]] = hidden
     return out.reshape(count * len(windows), -1)
+
+
+def _defaults(model: Model, count: int, t: Array) -> Array:
+    """Hidden states (count, n, nh) at times (n,) of which nothing is remembered."""
+    out = np.tile(model.hidden_default, (count, len(t), 1))
+    names = [s.name for s in model.hidden]
+    if "time" in names:
+        out[:, :, names.index("time")] = t
+    return out
 
 
 @final
@@ -98,19 +104,13 @@ class _Past:
 
     def found(self) -> dict[int, Array]:
         """Per piece, hidden states (count, stops, nh)."""
-        known, way = self._at_once(), self.way
-        if known is None:
-            known = self._stepwise()
+        known, way = self._at_once() or self._stepwise(), self.way
         return {p: np.stack([known[s][:, i] for s in way.stops[p].tolist()], axis=1) for i, p in enumerate(way.pieces)}
 
     @cached_property
     def start(self) -> Array:
         """Hidden states (count, pieces, nh) at the first sample."""
-        hidden = np.tile(self.model.hidden_default, (self.count, len(self.way.pieces), 1))
-        names = [s.name for s in self.model.hidden]
-        if "time" in names:
-            hidden[:, :, names.index("time")] = [self.way.measured.times[p][0] for p in self.way.pieces]
-        return hidden
+        return _defaults(self.model, self.count, np.array([self.way.measured.times[p][0] for p in self.way.pieces]))
 
     def _rows(self, pieces: int) -> dict[str, Array | float]:
         return {n: np.repeat(v, pieces) if np.ndim(v) else v for n, v in self.parameters.items()}

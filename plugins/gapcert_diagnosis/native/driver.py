@@ -53,7 +53,7 @@ def diagnose_native(model: NativeModel, problem: DiagnosisProblem) -> Diagnosis:
     fitted, held = _checked(model, parts)
     if not horizons:
         raise UsageError("diagnose: no horizon is given; name at least one in seconds, such as [0.5]")
-    tell = _counted(problem.emit)
+    tell = _counted(problem.clock.emit)
     entries = nominees(model, {e.name for e in problem.effects}, simulated=bool(parts[0].noise))
     store = Scores(None if problem.folder is None else problem.folder / "scores")
     lap("evidence")

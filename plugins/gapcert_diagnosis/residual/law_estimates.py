@@ -71,7 +71,7 @@ class Fitted:
         self.base, self.full = self.without(causes), library.extended(causes, self.values)
         self.tangent = Tangent.of(self.full, windows, fitted)
         self.x, self.u = self.tangent.x, self.tangent.u
-        self._places: dict[tuple[str, str], Place] = {}
+        self.places: dict[tuple[str, str], Place] = {}
 
     @property
     def flat(self) -> tuple[Array, Array]:
@@ -103,9 +103,9 @@ class Fitted:
 
     def place(self, site: str, kind: str) -> Place:
         """Where a coordinate or an input acts."""
-        if (site, kind) not in self._places:
-            self._places[site, kind] = self._place(site, kind)
-        return self._places[site, kind]
+        if (site, kind) not in self.places:
+            self.places[site, kind] = self._place(site, kind)
+        return self.places[site, kind]
 
     def _place(self, site: str, kind: str) -> Place:
         x, u = self.flat
@@ -206,13 +206,12 @@ def _corrected(path: Fitted, place: Place, axis: Axis, left: Law, correction: Co
 
 def _groups(path: Fitted) -> Sequence[tuple[Place, Causes, Axis, Array]]:
     """(place, causes, quantity, their law (W, S)): causes at one place that depend on one quantity are one law."""
-    found: dict[tuple[str, str], list[Candidate]] = {}
-    places: dict[str, Place] = {}
-    best: dict[tuple[str, str], Axis] = {}
+    groups: dict[tuple[str, str], list[Candidate]] = {}
+    where: dict[tuple[str, str], tuple[Place, Axis]] = {}
     for c in path.causes:
         if c.effect.site == "output":
             continue
-        place = _place(path, c, places)
+        place = _place(path, c)
         law = place.size(path.added((c,)))
         axes = path.axes(place)
         shares = [carried(law, a) for a in axes]
@@ -220,13 +219,11 @@ def _groups(path: Fitted) -> Sequence[tuple[Place, Causes, Axis, Array]]:
         axis = path.time if timed else axes[next(i for i, s in enumerate(shares) if s >= max(shares) - NEAR)]
         if max(shares) < ALONE and _remembers(path.library.extension(c)):
             axis = _turned(path, c, place, axes) or axis
-        key = place.site, axis.name
         # A law that no single quantity carries stands alone.
-        if max(shares) < ALONE or timed:
-            key = place.site, f"{axis.name} {c.effect.name}"
-        found.setdefault(key, []).append(c)
-        best[key] = axis
-    return [(places[k[0]], tuple(g), best[k], places[k[0]].size(path.added(tuple(g)))) for k, g in found.items()]
+        key = place.site, f"{axis.name} {c.effect.name}" if max(shares) < ALONE or timed else axis.name
+        groups.setdefault(key, []).append(c)
+        where[key] = place, axis
+    return [(place, g, axis, place.size(path.added(g))) for k, (place, axis) in where.items() for g in (tuple(groups[k]),)]
 
 
 def _turned(path: Fitted, c: Candidate, place: Place, axes: list[Axis]) -> Axis | None:
@@ -236,16 +233,14 @@ def _turned(path: Fitted, c: Candidate, place: Place, axes: list[Axis]) -> Axis 
     return next((a for a in axes if (a.name in inputs if follows else a.name == place.site)), None)
 
 
-def _place(path: Fitted, c: Candidate, places: dict[str, Place]) -> Place:
-    """Of a parameter: the coordinate whose motion it changes most."""
+def _place(path: Fitted, c: Candidate) -> Place:
+    """Of a parameter: the one of all known by now, coordinates among them, whose motion it changes most."""
     if c.effect.site != "parameter":
-        places.setdefault(c.site, path.place(c.site, c.effect.site))
-        return places[c.site]
+        return path.place(c.site, c.effect.site)
     moved, spread = path.added((c,)), np.std(path.x, axis=(0, 1)) + 1e-300
     for q in path.base.sites("coordinate"):
-        places.setdefault(q, path.place(q, "coordinate"))
-    share = {q: float(np.sqrt(np.mean(moved[..., p.column] ** 2)) / spread[p.column]) for q, p in places.items()}
-    return places[max(share, key=lambda q: share[q])]
+        path.place(q, "coordinate")
+    return max(path.places.values(), key=lambda p: float(np.sqrt(np.mean(moved[..., p.column] ** 2)) / spread[p.column]))
 
 
 def _law(path: Fitted, place: Place, group: Causes, axis: Axis, law: Array) -> Law:
