@@ -11,8 +11,8 @@ from gapcert.testing import multisine
 from gapcert_diagnosis.data.dataset import Measured
 from gapcert_diagnosis.fitting.fit import Fit, Hypothesis, fit
 from gapcert_diagnosis.search.candidates import Candidate, Library
-from gapcert_diagnosis.search.criterion import agreement, better, noise
-from gapcert_diagnosis.search.stepwise import Search
+from gapcert_diagnosis.search.criterion import agreement, better, falls, noise
+from gapcert_diagnosis.search.fitted_sets import FittedSets
 from gapcert_diagnosis.testing import ROD, equations
 from gapcert_effects.friction import CoulombFriction, ViscousFriction
 from gapcert_effects.gravity import ConstantForce
@@ -108,7 +108,7 @@ def test_intervals_hold_the_truth_when_nothing_is_hidden(effect):
     for seed in range(4):
         model, recording = simulated(seed=seed)
         measured = Measured.of(model, recording)
-        search = Search(Library(model, measured, [effect]), measured.windows(100))
+        search = FittedSets(Library(model, measured, [effect]), measured.windows(100))
         c = search.library.candidates[0]
         fitted = search.fit((c,), ((), search.nothing))
         inside.append(abs(fitted.theta[0]) <= 1.5 * fitted.interval()[0])
@@ -120,7 +120,7 @@ def test_uncertain_parameters_are_nuisances_within_three_tolerances():
     model, recording = simulated(LOOSE, parameters={"m": np.array([1.03])})
     measured = Measured.of(model, recording)
     library = Library(model, measured, [ViscousFriction()])
-    nothing = Search(library, measured.windows(100)).nothing
+    nothing = FittedSets(library, measured.windows(100)).nothing
     assert nothing.hypothesis.names == ("m",)
     assert nothing.hypothesis.charged == 0
     assert nothing.theta[0] == pytest.approx(1.03, abs=0.002)
@@ -129,7 +129,7 @@ def test_uncertain_parameters_are_nuisances_within_three_tolerances():
     assert library.extended((), {"m": float(nothing.theta[0])}) is found
     assert library.extended((), {"m": 1.01}).parameters[0].value == 1.01
     model, recording = simulated(LOOSE, parameters={"m": np.array([1.3])})
-    far = Search(Library(model, Measured.of(model, recording), []), Measured.of(model, recording).windows(100)).nothing
+    far = FittedSets(Library(model, Measured.of(model, recording), []), Measured.of(model, recording).windows(100)).nothing
     assert far.theta[0] == pytest.approx(1.06)
     assert far.chi[0] > 10
 
@@ -181,8 +181,8 @@ def test_where_a_law_is_plainly_missing_windows_count_and_samples_do_not():
     plain, most = fitted(np.ones(12)), fitted(np.full(12, 0.7))
     one = fitted(np.r_[0.2, np.full(11, 1.02)])
     assert better(one, most) > 0 > better(one, most, cautious=True)
-    assert better(most, plain, cautious=True) <= agreement(most, plain) ** 2 + 1e-9
-    assert agreement(most, plain) > 10 > 3 > agreement(one, plain)
+    assert better(most, plain, cautious=True) <= agreement(falls(most, plain)) ** 2 + 1e-9
+    assert agreement(falls(most, plain)) > 10 > 3 > agreement(falls(one, plain))
     calm = fitted(1 / size)
     assert (
         better(calm, plain, cautious=True) == better(calm, plain) > 100

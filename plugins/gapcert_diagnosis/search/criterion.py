@@ -1,14 +1,35 @@
-"""Sets of causes with their fits, and by how much one of them is the better explanation."""
+"""When is one set of causes the better explanation? Every acceptance test of the search, as a function of what it compares.
+
+ΔS is the fall of the score from the old fit to the new one (`better`), z the agreement of windows (`agreement`), χ the mean
+squared residual of a channel over that of noise, G the charge for one more cause, 12 + 2 ln(candidates).
+
+| test           | compares                         | holds where                                   | asked by       |
+| -------------- | -------------------------------- | --------------------------------------------- | -------------- |
+| `noise`        | a fit, the noise floor           | χ ≤ max(NOISE, 1 + chance) in all channels    | everyone       |
+| `pays`         | a set, one without some causes   | χ falls, ΔS > G; z > SURE if it falls little  | steps, drops   |
+| `decides`      | a set, one without one cause     | χ > PLAIN² without it, most of that gone      | `matters`      |
+| `outdoes`      | a set, one on another path       | ΔS > 0; if it is larger ΔS > G, and it pays   | steps          |
+| `beats`        | two causes at once, single steps | ΔS > TIE; ΔS > 0 if they are fewer            | pairs          |
+| `margin`       | a set, one with another law      | ΔS > ±`richer` by its numbers; as many: ±TIE  | exchanges      |
+| `richer`       | a law, one that it contains      | ΔS > RICHER                                   | ties, `margin` |
+| `agrees`       | two fits, on later data          | these see AGREE of the excess over noise gone | later data     |
+| `fails`        | a fit on later data, its due     | χ > LATE times what is due                    | later data     |
+| `setting_pays` | a fit under another setting      | χ falls by MUCH, ΔS > charge                  | settings       |
+
+Where a search is cautious and the closer of two fits is rough, ΔS is at most z², `rough_charge` stands for G, and SURE² or
+SPARED for RICHER. `effect_size` says which causes are too small to be named, `native.stepwise` what pays for an engine.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import TypeVar
 
 import numpy as np
 
 from gapcert.plugin import Array
-from gapcert_diagnosis.fitting.fit import Fit
+from gapcert_diagnosis.fitting.fit import Fit, Hypothesis
 
 from .candidates import Causes, Library
 
@@ -17,9 +38,23 @@ SURE, OFTEN = 3.0, 0.8  # standard errors
 TIE = 10.0  # scores closer than this cannot be told apart
 COPIED = 6.6  # score of one number that is there by chance in one of a hundred cases
 COLOURED = 0.5  # whiteness below which a residual is no white noise
+FALL = 0.03  # least relative fall of the squared residual
+PRIOR_FALL = 16.0  # of the prior, where a wrong value was hidden in other numbers
+SMALL, SMALL_COLOURED = 0.1, 0.3  # relative falls below which windows must agree by SURE; the second where coloured
+PLAIN, MOSTLY = 5.0, (0.5, 0.8)  # noise floors; share of the residual that a cause of little force must explain, if it is rough
+RICHER = 4.0  # score by which a law must beat one that it contains, beyond the charge for its numbers
+SPARED = 1.0  # the same at one of several sites that are judged at once: windows that lean to it by a standard error
+QUIET = 1.1  # residual per noise floor below which later data have nothing to say
+SAME = 0.1  # noise floors between two motions that later data cannot tell apart
+CREEP = 1.5  # residual per noise floor of later data at rest: a law may let a joint creep that sticks
+LEAN = 1.0  # standard errors by which rough windows must agree
+AGREE = 0.15  # least share of the excess over the noise that the guard must see explained
+LATE = 1.5  # times the residual of the earlier windows, from which the later ones may hold a push of their own
+MUCH = 0.5  # least share of the squared residual that a setting explains: a stand-in for what is missing takes less
 
 Keys = frozenset[tuple[str, str]]
 Found = tuple[Causes, Fit]
+T = TypeVar("T")
 
 
 def better(new: Fit, old: Fit, cautious: bool = False) -> float:
@@ -31,12 +66,16 @@ def better(new: Fit, old: Fit, cautious: bool = False) -> float:
     closer = closest([new, old])
     robust = cautious and closer.rough
     fell = old.score(closer, robust) - new.score(closer, robust)
-    return math.copysign(min(abs(fell), agreement(new, old) ** 2), fell) if robust else fell
+    return math.copysign(min(abs(fell), agreement(falls(new, old)) ** 2), fell) if robust else fell
 
 
-def agreement(new: Fit, old: Fit) -> float:
-    """z: the mean fall of the windows' scores over its standard error. Each has one voice, however badly it is fitted."""
-    fell = np.sum(new.whiteness * (np.log(old.each) - np.log(new.each)), axis=1)
+def falls(new: Fit, old: Fit) -> Array:
+    """(W,): the falls of the windows' scores."""
+    return np.asarray(np.sum(new.whiteness * (np.log(old.each) - np.log(new.each)), axis=1))
+
+
+def agreement(fell: Array) -> float:
+    """z: the mean of falls over its standard error. Each window, or trajectory, has one voice, however badly it is fitted."""
     error = float(np.std(fell, ddof=1)) / math.sqrt(len(fell)) if len(fell) > 1 else math.inf
     return float(fell.mean()) / max(error, 1e-12)
 
@@ -51,16 +90,104 @@ def noise(fitted: Fit, beyond: float = OFTEN) -> bool:
     return bool((fitted.chi <= np.maximum(NOISE, 1 + chance)).all())
 
 
+def pays(new: Fit, old: Fit, charge: float, rough: float | None = None) -> bool:
+    """Does the score fall by more than a larger set must bring, and the residual, or the prior, with it?
+
+    rough: what is charged to a cautious search where the closer fit is rough.
+    """
+    fell, by_prior = 1 - new.chi / old.chi, old.prior - new.prior > PRIOR_FALL
+    if not ((fell > FALL).any() or by_prior):
+        return False
+    if rough is not None and closest([new, old]).rough:
+        return better(new, old, cautious=True) > min(rough, charge)
+    if better(new, old) <= charge:
+        return False
+    most = int(np.argmax(fell))
+    small = SMALL if new.whiteness[most] > COLOURED else SMALL_COLOURED
+    return bool(fell[most] > small or by_prior) or agreement(falls(new, old)) > SURE
+
+
+def decides(whole: Fit, without: Fit) -> bool:
+    """Is the residual plainly above the noise without a cause, and most of it gone with it?"""
+    most = MOSTLY[whole.rough]
+    return bool(((without.chi > PLAIN**2) & (whole.chi < (1 - most) ** 2 * without.chi)).any())
+
+
+def outdoes(new: Fit, best: Fit, charge: float, rough: float | None = None, *, larger: bool) -> bool:
+    """Is it better? One that is larger, on whatever path it was found, must pay for that, too."""
+    fell = better(new, best, rough is not None)
+    return fell > charge and pays(new, best, charge, rough) if larger else fell > 0
+
+
+def beats(new: Fit, old: Fit, cautious: bool, *, fewer: bool) -> bool:
+    """By a plain difference of the score, or with fewer causes."""
+    return better(new, old, cautious) > (0.0 if fewer else TIE)
+
+
+def richer(fits: Sequence[Fit], cautious: bool, spared: bool = False) -> float:
+    """The score by which a law must beat one that it contains; spared: at one of several sites that are judged at once."""
+    rough = SPARED if spared else SURE**2
+    return rough if cautious and closest(fits).rough else RICHER
+
+
+def margin(fits: Sequence[Fit], more: int, cautious: bool, *, merged: bool, spared: bool) -> float:
+    """The score by which a set must beat one with another law in a law's place, if it has so many numbers more.
+
+    merged: it has one law instead of two; with as many numbers, that need not even fit as well.
+    """
+    if more == 0:
+        return -TIE if merged else TIE
+    return math.copysign(richer(fits, cautious, spared), more)
+
+
+def agrees(new: Fit, old: Fit, one: Fit, two: Fit) -> bool:
+    """Do later data see a share of the excess over the noise explained, or no harm done where the prior alone spoke?
+
+    one, two: the numbers of the new and of the old fit on the later data.
+    """
+    after, before = one.chi, two.chi
+    # A push that is over, a joint at rest, a channel that is not moved here: these data contradict nothing.
+    if max(after.max(), before.max()) < QUIET or np.mean((one.residual - two.residual) ** 2) < SAME**2:
+        return True
+    concerned = new.chi < (1 - FALL) * old.chi
+    if before[concerned].max(initial=0.0) < QUIET and agreement(falls(one, two)) > -SURE and after.max() < CREEP:
+        return True
+    if one.rough:
+        fell = (two.typical - one.typical) / np.maximum(two.typical - 1, 1e-9)
+        return bool(fell.max() >= AGREE and agreement(falls(one, two)) > LEAN)
+    worst = int(np.argmax(before))
+    if old.prior - new.prior > PRIOR_FALL and (after < 1.05 * np.maximum(before, 1.0)).all():
+        return True
+    return bool(before[worst] - after[worst] >= max(AGREE * (before[worst] - 1), 1e-9))
+
+
+def fails(later: Fit, chi: float) -> bool:
+    """Is a fit, judged on later data, plainly further off there than it should be?"""
+    return float(later.chi.max()) > LATE * chi
+
+
+def setting_pays(new: Fit, old: Fit, charge: float, *, fewer: bool) -> bool:
+    """In place of causes only the choice of a setting is charged; beside them it pays for itself."""
+    if fewer:
+        return better(new, old) > charge - 12
+    much = bool((new.chi < (1 - MUCH) * old.chi).any() and new.chi.sum() < old.chi.sum())
+    return much and better(new, old) > charge
+
+
 def closest(fits: Sequence[Fit]) -> Fit:
     return min(fits, key=lambda f: float(f.chi.sum()))
 
 
-def ranked(found: Sequence[Found], cautious: bool = False) -> list[Found]:
-    """Best score first, all as the closest fit has it."""
-    if not found:
-        return []
-    best = closest([f for _, f in found])
-    return sorted(found, key=lambda f: f[1].score(best, cautious and best.rough))
+def scores(fits: Sequence[Fit], cautious: bool) -> list[float]:
+    """All as the closest of them has it."""
+    best = closest(fits) if fits else None
+    return [f.score(best, cautious and best.rough) for f in fits] if best else []
+
+
+def rank(found: Sequence[tuple[T, Fit]], cautious: bool = False) -> list[tuple[T, Fit]]:
+    """Best score first."""
+    marks = scores([f for _, f in found], cautious)
+    return [f for _, f in sorted(zip(marks, found, strict=True), key=lambda p: p[0])]
 
 
 def rough_charge(library: Library, causes: Causes, before: Causes) -> float:
@@ -82,41 +209,20 @@ def values(fitted: Fit) -> dict[str, float]:
     return dict(zip(fitted.hypothesis.names, map(float, fitted.theta), strict=True))
 
 
+def numbers(h: Hypothesis, known: Mapping[str, float]) -> Array:
+    """Numbers (p,) of a hypothesis: those that are known, and the others as they are stated."""
+    return np.array([known.get(n, v) for n, v in zip(h.names, h.value.tolist(), strict=True)])
+
+
 def keys(causes: Causes) -> Keys:
     return frozenset(c.key for c in causes)
 
 
-def lightest(library: Library, causes: Causes, fitted: Fit) -> tuple[Causes, Array]:
-    """(causes, shares): the least needed first, and of the squared residual what these first ones together keep away.
-
-    To second order, from the covariance of what is off: dᵀ Σ⁻¹ d / Σ r².
-    """
-    names, whole = list(fitted.hypothesis.names), max(float(np.sum(fitted.residual**2)), 1e-300)
-    rows, gaps = [], []
-    for c in causes:
-        k, off = library.amplitude(c), library.off(c)
-        own = range(len(off)) if k is None else (k,)
-        rows.append([names.index(library.names(c)[i]) for i in own])
-        gaps.append([fitted.theta[r] - off[i] for r, i in zip(rows[-1], own, strict=True)])
-
-    def share(some: Sequence[int]) -> float:
-        r, d = (np.concatenate([a[i] for i in some]) for a in (rows, gaps))
-        return float(d @ np.linalg.pinv(fitted.covariance[np.ix_(r, r)], hermitian=True) @ d) / whole
-
-    order = sorted(range(len(causes)), key=lambda i: share([i]))
-    return tuple(causes[i] for i in order), np.array([share(order[: i + 1]) for i in range(len(order))])
+def without(causes: Causes, others: Causes) -> Causes:
+    """Those that are not among the others."""
+    return tuple(c for c in causes if c.key not in keys(others))
 
 
 def named(causes: Causes) -> str:
     """`coulomb-friction at q + viscous-friction at q`."""
     return " + ".join(f"{effect} at {site}" for effect, site in (c.key for c in causes)) or "no cause"
-
-
-def so_far(fits: Mapping[Keys, Found]) -> dict[str, str]:
-    """The set with the least error on the fitted windows, and the share of it that is left: what one sees meanwhile."""
-    tried = [found for found in fits.values() if found[0]]
-    before = float(fits[frozenset()][1].chi.sum()) if frozenset() in fits else 0.0
-    if not tried or before <= 0:
-        return {}
-    causes, least = min(tried, key=lambda found: float(found[1].chi.sum()))
-    return {"best": named(causes), "error left": f"{math.sqrt(float(least.chi.sum()) / before):.0%}"}
