@@ -18,14 +18,14 @@ from .results import Correction, Experiment
 from .search.candidates import Causes
 
 if TYPE_CHECKING:
-    from .search.stepwise import Search
+    from .search.fitted_sets import FittedSets
 
 LAGS, SLOW = 0.5, 24  # s; samples that are looked at where these are far apart
 CHANNELS = 4  # whose correlations are drawn
 
 
 def figure(
-    search: Search,
+    search: FittedSets,
     causes: Causes,
     last: Fit,
     judge: Stretches,

@@ -12,7 +12,7 @@ from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.fitting.fit import Fit, Hypothesis, fit
 from gapcert_diagnosis.search.candidates import Candidate, Library
 from gapcert_diagnosis.search.criterion import agreement, better, falls, noise
-from gapcert_diagnosis.search.stepwise import Search
+from gapcert_diagnosis.search.fitted_sets import FittedSets
 from gapcert_diagnosis.testing import ROD, equations
 from gapcert_effects.friction import CoulombFriction, ViscousFriction
 from gapcert_effects.gravity import ConstantForce
@@ -108,7 +108,7 @@ def test_intervals_hold_the_truth_when_nothing_is_hidden(effect):
     for seed in range(4):
         model, recording = simulated(seed=seed)
         measured = Dataset.of(model, recording)
-        search = Search(Library(model, measured, [effect]), measured.windows(100))
+        search = FittedSets(Library(model, measured, [effect]), measured.windows(100))
         c = search.library.candidates[0]
         fitted = search.fit((c,), ((), search.nothing))
         inside.append(abs(fitted.theta[0]) <= 1.5 * fitted.interval()[0])
@@ -120,7 +120,7 @@ def test_uncertain_parameters_are_nuisances_within_three_tolerances():
     model, recording = simulated(LOOSE, parameters={"m": np.array([1.03])})
     measured = Dataset.of(model, recording)
     library = Library(model, measured, [ViscousFriction()])
-    nothing = Search(library, measured.windows(100)).nothing
+    nothing = FittedSets(library, measured.windows(100)).nothing
     assert nothing.hypothesis.names == ("m",)
     assert nothing.hypothesis.charged == 0
     assert nothing.theta[0] == pytest.approx(1.03, abs=0.002)
@@ -129,7 +129,7 @@ def test_uncertain_parameters_are_nuisances_within_three_tolerances():
     assert library.extended((), {"m": float(nothing.theta[0])}) is found
     assert library.extended((), {"m": 1.01}).parameters[0].value == 1.01
     model, recording = simulated(LOOSE, parameters={"m": np.array([1.3])})
-    far = Search(Library(model, Dataset.of(model, recording), []), Dataset.of(model, recording).windows(100)).nothing
+    far = FittedSets(Library(model, Dataset.of(model, recording), []), Dataset.of(model, recording).windows(100)).nothing
     assert far.theta[0] == pytest.approx(1.06)
     assert far.chi[0] > 10
 

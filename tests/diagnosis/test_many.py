@@ -14,18 +14,17 @@ from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.diagnose import _largest_first
 from gapcert_diagnosis.fitting import fit as fitting
 from gapcert_diagnosis.fitting.rollout_error import Stretches, stretches
-from gapcert_diagnosis.search import moves as swapping
+from gapcert_diagnosis.search import fitted_sets, moves
 from gapcert_diagnosis.search import screening as screening
-from gapcert_diagnosis.search import shortlist
 from gapcert_diagnosis.search import stepwise as searching
 from gapcert_diagnosis.search.alternatives import answered
 from gapcert_diagnosis.search.candidates import Library
-from gapcert_diagnosis.search.criterion import keys, lightest, noise, values
-from gapcert_diagnosis.search.moves import idle
-from gapcert_diagnosis.search.pairs import leapt
-from gapcert_diagnosis.search.screening import Screen, _distinct
-from gapcert_diagnosis.search.shortlist import replacements, standing_in
-from gapcert_diagnosis.search.stepwise import Search
+from gapcert_diagnosis.search.criterion import keys, noise, values
+from gapcert_diagnosis.search.fitted_sets import FittedSets
+from gapcert_diagnosis.search.gains import GainTable
+from gapcert_diagnosis.search.moves import additions, idle, replacements
+from gapcert_diagnosis.search.screening import Screen, _distinct, standing_in
+from gapcert_diagnosis.search.stepwise import EquationSearch, lightest
 from gapcert_diagnosis.testing import equations
 
 TWO = {
@@ -71,7 +70,7 @@ def with_all(search, *names):
 @pytest.mark.exam
 def test_one_program_with_a_law_at_all_sites_screens_as_many_do():
     library, windows = prepared()
-    search = Search(library, windows)
+    search = FittedSets(library, windows)
     screen = Screen(library, windows, search.nothing)
     for c in library.candidates:
         rows, names = _distinct(library.starts(c), library.amplitude(c)), library.names(c)
@@ -87,7 +86,7 @@ def test_one_program_with_a_law_at_all_sites_screens_as_many_do():
 @pytest.mark.exam
 def test_a_law_is_screened_at_all_its_sites_in_one_pass(monkeypatch):
     library, windows = prepared("coulomb-friction", level=0.1, laws=("dahl-friction", "viscous-friction"))
-    search, passes = Search(library, windows), []
+    search, passes = FittedSets(library, windows), []
     at_once, alone = (Screen(library, windows, search.nothing) for _ in range(2))
     plain = Screen._moved
     monkeypatch.setattr(Screen, "_moved", lambda self, model, given, n: passes.append(n) or plain(self, model, given, n))
@@ -104,7 +103,7 @@ def test_a_law_is_screened_at_all_its_sites_in_one_pass(monkeypatch):
 @pytest.mark.exam
 def test_causes_that_do_nothing_weigh_least():
     library, windows = prepared(coefficient=5e-4)
-    search = Search(library, windows)
+    search = FittedSets(library, windows)
     causes, fitted = with_all(search, "viscous-friction", "linear-spring")
     order, lost = lightest(library, causes, fitted)
     assert order[-1].key == ("viscous-friction", "b")
@@ -118,7 +117,7 @@ def test_causes_that_do_nothing_weigh_least():
 @pytest.mark.exam
 def test_idle_causes_are_dropped_together(monkeypatch):
     library, windows = prepared(sigma=1e-3)
-    search = Search(library, windows)
+    search = FittedSets(library, windows)
     found = with_all(search, "viscous-friction", "linear-spring", "coulomb-friction")
     assert len(found[0]) == 6
     fits, made = [], search.fit
@@ -128,43 +127,43 @@ def test_idle_causes_are_dropped_together(monkeypatch):
         return made(causes, *rest)
 
     monkeypatch.setattr(search, "fit", counted)
-    rest, _ = search._pruned(found)
+    rest, _ = EquationSearch(search).prune(found)
     assert keys(rest) == {("viscous-friction", "b")}
     assert len(fits) == 1
 
 
 def test_an_older_cause_that_a_new_one_replaces_is_dropped():
     library, windows = prepared()
-    search = Search(library, windows)
+    search = FittedSets(library, windows)
     stand_in = tuple(c for c in library.candidates if c.key == ("coulomb-friction", "b"))
     right = tuple(c for c in library.candidates if c.key == ("viscous-friction", "b"))
     parent = stand_in, search.fit(stand_in, None)
     both = (*stand_in, *right), search.fit((*stand_in, *right), parent)
-    assert keys(search._lighter(both, parent)[0]) == {("viscous-friction", "b")}
+    assert keys(EquationSearch(search).drop_negligible(both, parent)[0]) == {("viscous-friction", "b")}
 
 
 @pytest.mark.exam
 def test_what_is_left_is_noise_once_the_cause_is_there(monkeypatch):
     library, windows = prepared()
-    search = Search(library, windows)
+    search = FittedSets(library, windows)
     assert not noise(search.nothing)
     right = search.fit(tuple(c for c in library.candidates if c.key == ("viscous-friction", "b")), None)
     assert noise(right)
     assert not noise(replace(right, residual=1.2 * right.residual))
-    widths, step = [], search._forward
-    monkeypatch.setattr(search, "_forward", lambda width: widths.append(width) or step(width))
-    assert keys(search.forward()[0]) == {("viscous-friction", "b")}
+    widths, step = [], searching.forward
+    monkeypatch.setattr(searching, "forward", lambda sets, width=1, *more: widths.append(width) or step(sets, width, *more))
+    assert keys(EquationSearch(search).forward()[0]) == {("viscous-friction", "b")}
     assert widths == [1]
     monkeypatch.setattr(searching, "noise", lambda fitted: False)
-    search.forward()
+    EquationSearch(search).forward()
     assert widths == [1, 1, searching.BEAM]
 
 
 @pytest.mark.exam
 def test_rivals_of_a_cause_are_single_laws_that_do_not_contain_it():
     library, windows = prepared("coulomb-friction", level=0.05)
-    search = Search(library, windows.guard()[0])
-    found = search.forward()
+    search = FittedSets(library, windows.guard()[0])
+    found = EquationSearch(search).forward()
     assert keys(found[0]) == {("coulomb-friction", "b")}
     answer = answered(search, found, windows)
     rivals = [f[0] for group in answer.rivals.values() for f in group]
@@ -183,37 +182,40 @@ def test_of_very_many_candidates_some_are_piled_up(monkeypatch):
     library = Library(model, Dataset.of(model, log), [gc.registry().build("effect", n) for n in LAWS])
     windows = library.measured.windows(80)
     truth = {("viscous-friction", "a"), ("viscous-friction", "b"), ("input-gain", "w")}
-    stepwise = Search(library, windows)
-    assert stepwise._pursued() is None
+    stepwise = EquationSearch(FittedSets(library, windows))
+    assert stepwise.try_piles() is None
     assert keys(stepwise.forward()[0]) == truth
-    monkeypatch.setattr(searching, "CROWD", 1)
+    for module in (searching, fitted_sets):
+        monkeypatch.setattr(module, "CROWD", 1)
     monkeypatch.setattr(searching, "ALONE", 0.95)
-    few = Search(library, windows)
-    monkeypatch.setattr(few, "additions", None)
+    few = EquationSearch(FittedSets(library, windows))
+    monkeypatch.setattr(searching, "additions", None)
     found = few.forward()
     assert keys(found[0]) == truth
     assert values(found[1])["input_gain_w"] == pytest.approx(0.7, rel=0.01)
-    monkeypatch.setattr(few.screen, "pairs", None)  # a pile of all candidates needs no pairs beside it
-    assert leapt(few, found) is found
+    monkeypatch.setattr(GainTable, "pairs", None)  # a pile of all candidates needs no pairs beside it
+    assert few.try_pairs(found) is found
     monkeypatch.setattr(searching, "ALONE", 0.0)
-    assert few._pursued() is None
+    assert few.try_piles() is None
 
 
 def test_a_pile_grows_by_what_the_last_one_leaves():
     library, windows = prepared()
-    search = Search(library, windows)
-    ((sets, gains),) = search.screen.pursued([(search.nothing, 1)], 3)
+    search = FittedSets(library, windows)
+    (table,) = search.screen.tables([(search.nothing, 1)])
+    sets = table.pursue(3)
+    gains = [s.gain for s in sets]
     assert [len(s.move) for s in sets] == [1, 2, 3]
     assert gains == sorted(gains)
     assert all(set(a.move) < set(b.move) for a, b in itertools.pairwise(sets))
-    pairs = search.screen.pairs([(search.nothing, 1)], 1)
+    pairs = table.pairs(1)
     assert gains[0] < gains[1] <= pairs[0].gain * (1 + 1e-9)
 
 
 def test_of_a_law_that_is_asked_for_alone_there_is_no_rival():
     library, windows = prepared()
     few = Library(library.model, library.measured, [gc.registry().build("effect", "viscous-friction")])
-    search = Search(few, windows.guard()[0])
+    search = FittedSets(few, windows.guard()[0])
     found = few.candidates, search.fit(few.candidates, None)
     answer = answered(search, found, windows)
     assert keys(answer.causes) == keys(few.candidates)
@@ -222,9 +224,9 @@ def test_of_a_law_that_is_asked_for_alone_there_is_no_rival():
 
 @pytest.mark.exam
 def test_the_richest_law_is_not_fitted_where_those_between_leave_no_less(monkeypatch):
-    monkeypatch.setattr(swapping, "noise", lambda fitted: False)
+    monkeypatch.setattr(moves, "noise", lambda fitted: False)
     dry = ("coulomb-friction", "stribeck-friction", "dahl-friction", "lugre-friction")
-    search = Search(*prepared("coulomb-friction", level=0.1, laws=dry))
+    search = FittedSets(*prepared("coulomb-friction", level=0.1, laws=dry))
     plain, stribeck, dahl, lugre = ((c,) for c in search.library.candidates if c.site == "b")
     found = plain, search.fit(plain, None)
     assert not idle(search, found, lugre)
@@ -239,7 +241,7 @@ def test_where_noise_is_left_a_law_that_remembers_is_fitted_only_if_its_first_va
     laws = ("coulomb-friction", "dahl-friction")
     idled = []
     for hidden, numbers in (("coulomb-friction", {"level": 0.1}), ("dahl-friction", {"level": 0.1, "displacement": 0.02})):
-        search = Search(*prepared(hidden, laws=laws, **numbers))
+        search = FittedSets(*prepared(hidden, laws=laws, **numbers))
         plain, dahl = ((c,) for c in search.library.candidates if c.site == "b")
         found = plain, search.fit(plain, None)
         idled.append(idle(search, (plain, replace(found[1], residual=found[1].residual)), dahl))
@@ -249,16 +251,16 @@ def test_where_noise_is_left_a_law_that_remembers_is_fitted_only_if_its_first_va
 
 @pytest.mark.exam
 def test_only_what_promises_much_of_what_a_cause_does_is_tried_in_its_place(monkeypatch):
-    search = Search(*prepared(coefficient=0.1, laws=("viscous-friction", "linear-spring", "input-gain", "sensor-bias")))
+    search = FittedSets(*prepared(coefficient=0.1, laws=("viscous-friction", "linear-spring", "input-gain", "sensor-bias")))
     own = next(c for c in search.library.candidates if c.key == ("viscous-friction", "b"))
     tried = []
-    plain = Search.tried
-    monkeypatch.setattr(Search, "tried", lambda self, *given: tried.append(given[2]) or plain(self, *given))
+    plain = FittedSets.try_move
+    monkeypatch.setattr(FittedSets, "try_move", lambda self, *given: tried.append(given[1]) or plain(self, *given))
     nothing = ((), search.nothing)
     search.fit((own,), nothing)
-    found = search.additions((), nothing, instead=own, hope=-np.inf)
+    found = additions(search, nothing, instead=own, hope=-np.inf)
     kept = []
-    for promised in search.promised(nothing):
+    for promised in search.promises(nothing):
         gains = {keys(s.move): s.gain for s in promised}
         kept.append({key for key, gain in gains.items() if gain > 0.25 * gains[frozenset({own.key})]})
     assert found
@@ -267,30 +269,30 @@ def test_only_what_promises_much_of_what_a_cause_does_is_tried_in_its_place(monk
 
 
 def test_what_promises_less_than_a_rival_far_behind_is_not_tried_and_the_best_alone_is_told(monkeypatch):
-    search = Search(*prepared(coefficient=0.1))
+    search = FittedSets(*prepared(coefficient=0.1))
     own = next(c for c in search.library.candidates if c.key == ("viscous-friction", "b"))
-    nothing, tried, plain = ((), search.nothing), [], Search.tried
+    nothing, tried, plain = ((), search.nothing), [], FittedSets.try_move
     search.fit((own,), nothing)
-    monkeypatch.setattr(Search, "tried", lambda self, *given: tried.append(given[2]) or plain(self, *given))
+    monkeypatch.setattr(FittedSets, "try_move", lambda self, *given: tried.append(given[1]) or plain(self, *given))
     known = set(search._fits)
-    found = search.additions((), nothing, instead=own, hope=-np.inf)
+    found = additions(search, nothing, instead=own, hope=-np.inf)
     assert len(found) == 1
     assert len(found[0][1].start) == len(search.short)
     assert set(search._fits) == known  # no long fit of any of them
     gains = {keys(s.move): s.gain for s in tried}
     passed = {key for key in search.lost if key not in gains}
     assert passed
-    promised = {keys(s.move): s.gain for p in search.promised(nothing, own) for s in p}
+    promised = {keys(s.move): s.gain for p in search.promises(nothing, own) for s in p}
     assert all(promised[key] < 0.7 * max(gains.values()) for key in passed)
 
 
 def test_a_law_that_remembers_is_passed_over_where_others_promise_much_more():
     library, windows = prepared(coefficient=0.1, laws=("viscous-friction", "linear-spring", "input-lag"))
-    search, known = Search(library, windows), {c.key: c for c in library.candidates}
+    search, known = FittedSets(library, windows), {c.key: c for c in library.candidates}
     own, spring, lag = known["viscous-friction", "b"], known["linear-spring", "b"], known["input-lag", "w"]
     nothing = ((), search.nothing)
     brief = search.brief(((own,), search.fit((own,), nothing)))
-    screened = {keys(s.move): s for p in search.promised(nothing) for s in p}
+    screened = {keys(s.move): s for p in search.promises(nothing) for s in p}
     outcomes = []
     for gain in (1.0, 3.0):  # of the spring's, times the lag's
         picks = [replace(screened[frozenset({c.key})], gain=g) for c, g in ((spring, 50.0 * gain), (lag, 50.0))]
@@ -302,13 +304,13 @@ def test_a_law_that_remembers_is_passed_over_where_others_promise_much_more():
 
 def test_two_steps_show_whether_a_rival_is_worth_the_others(monkeypatch):
     library, windows = prepared(coefficient=0.1, laws=("viscous-friction", "linear-spring"))
-    search, known = Search(library, windows), {c.key: c for c in library.candidates}
+    search, known = FittedSets(library, windows), {c.key: c for c in library.candidates}
     own, spring = known["viscous-friction", "b"], known["linear-spring", "b"]
     nothing = ((), search.nothing)
     brief = search.brief(((own,), search.fit((own,), nothing)))
-    picks = [s for s in search.promised(nothing)[0] if keys(s.move) == {spring.key}]
-    further, plain = [], shortlist.fit
-    monkeypatch.setattr(shortlist, "fit", lambda *given, **more: further.append(more["iterations"]) or plain(*given, **more))
+    picks = [s for s in search.promises(nothing)[0] if keys(s.move) == {spring.key}]
+    further, plain = [], FittedSets.fit_further
+    monkeypatch.setattr(FittedSets, "fit_further", lambda self, *given: further.append(given[1]) or plain(self, *given))
     replacements(search, picks, nothing, own, brief)
     assert further == []  # far behind the cause
     replacements(search, picks, nothing, own, replace(brief, residual=1e3 + brief.residual))
@@ -319,7 +321,7 @@ def test_two_steps_show_whether_a_rival_is_worth_the_others(monkeypatch):
 def test_the_cause_that_explains_most_stands_first():
     library, windows = prepared(sigma=1e-3)
     known = {c.key: c for c in library.candidates}
-    search = Search(library, windows)
+    search = FittedSets(library, windows)
     small, large = known["viscous-friction", "a"], known["viscous-friction", "b"]
     found = ((small, large), search.fit((small, large), None))
     answer = replace(answered(search, found, windows), causes=(small, large))
@@ -331,10 +333,10 @@ def test_what_could_stand_in_for_a_cause_is_screened_alone(monkeypatch):
     """The same gains as of all candidates, of fewer."""
     library, windows = prepared(coefficient=0.1)
     own = next(c for c in library.candidates if c.key == ("viscous-friction", "b"))
-    nothing, found = ((), Search(library, windows).nothing), []
+    nothing, found = ((), FittedSets(library, windows).nothing), []
     for crowd in (len(library.candidates) + 1, 1):
-        monkeypatch.setattr(searching, "CROWD", crowd)
-        found.append(Search(library, windows).promised(nothing, own))
+        monkeypatch.setattr(fitted_sets, "CROWD", crowd)
+        found.append(FittedSets(library, windows).promises(nothing, own))
     for every, few in zip(*found, strict=True):
         known = {keys(s.move): s.gain for s in every}
         assert frozenset({own.key}) in {keys(s.move) for s in few}
@@ -347,22 +349,23 @@ def test_what_could_stand_in_for_a_cause_is_screened_alone(monkeypatch):
 
 def test_promises_beside_causes_leave_out_what_these_explain():
     library, windows = prepared(coefficient=0.1)
-    search, dry = Search(library, windows), ("coulomb-friction", "b")
+    search, dry = FittedSets(library, windows), ("coulomb-friction", "b")
     causes = tuple(c for c in library.candidates if c.key == ("viscous-friction", "b"))
-    alone, beside = (search.screen.beside(search.nothing, 1, given) for given in ((), causes))
+    (table,) = search.screen.tables([(search.nothing, 1)])
+    alone, beside = (table.beside(given) for given in ((), causes))
     assert alone[dry] > 100
     assert beside[dry] < 0.05 * alone[dry]
     assert beside[causes[0].key] == 0
-    assert search.screen.beside(search.nothing, 1, ()) == alone
+    assert table.beside(()) == alone
 
 
 def test_first_values_beside_nothing_are_those_of_the_pile(monkeypatch):
     library, windows = prepared(coefficient=0.1)
-    plain, piled = Search(library, windows), Search(library, windows)
+    plain, piled = FittedSets(library, windows), FittedSets(library, windows)
     c = next(c for c in library.candidates if c.key == ("viscous-friction", "b"))
-    expected = next(s for s in plain.promised(((), plain.nothing))[0] if keys(s.move) == {c.key})
-    monkeypatch.setattr(searching, "CROWD", 1)
-    monkeypatch.setattr(piled.screen, "ranked", None)
+    expected = next(s for s in plain.promises(((), plain.nothing))[0] if keys(s.move) == {c.key})
+    monkeypatch.setattr(fitted_sets, "CROWD", 1)
+    monkeypatch.setattr(piled.screen, "rank", None)
     promised = piled.promise(((), piled.nothing), c)
     assert promised is not None
     assert promised.values == pytest.approx(dict(expected.values), rel=1e-9)
@@ -370,7 +373,7 @@ def test_first_values_beside_nothing_are_those_of_the_pile(monkeypatch):
 
 def test_a_held_out_rollout_is_made_once_for_a_fit(monkeypatch):
     library, windows = prepared()
-    search, judge, rolled = Search(library, windows), stretches(library.measured, [0.5])[-1], []
+    search, judge, rolled = FittedSets(library, windows), stretches(library.measured, [0.5])[-1], []
     plain = Stretches._simulated
     monkeypatch.setattr(Stretches, "_simulated", lambda self, fitted: rolled.append(fitted) or plain(self, fitted))
     other = replace(search.nothing, start=search.nothing.start.copy())
@@ -381,7 +384,7 @@ def test_a_held_out_rollout_is_made_once_for_a_fit(monkeypatch):
 
 def test_the_last_step_of_a_fit_needs_no_slopes_of_its_own(monkeypatch):
     library, windows = prepared()
-    best = with_all(Search(library, windows), "viscous-friction")[1]
+    best = with_all(FittedSets(library, windows), "viscous-friction")[1]
     made, plain = [], fitting._linearise
     monkeypatch.setattr(fitting, "_linearise", lambda *given: made.append(given[0]) or plain(*given))
     again = fitting.fit(best.hypothesis, windows, theta=best.theta, start=best.start)
@@ -392,7 +395,7 @@ def test_the_last_step_of_a_fit_needs_no_slopes_of_its_own(monkeypatch):
 
 def test_pushes_that_are_averaged_are_made_once_per_block(monkeypatch):
     library, windows = prepared(laws=("viscous-friction",))
-    nothing = Search(library, windows).nothing
+    nothing = FittedSets(library, windows).nothing
     fine = Screen(library, windows, nothing).push(library.candidates[0]).state
     monkeypatch.setattr(screening, "BLOCK", 0.02)
     coarse = Screen(library, windows, nothing).push(library.candidates[0]).state
@@ -405,9 +408,9 @@ def test_pushes_that_are_averaged_are_made_once_per_block(monkeypatch):
 def test_the_fit_of_nothing_is_made_once(monkeypatch):
     library, windows = prepared()
     plain = fitting.fit(library.hypothesis(()), windows)
-    made, real = [], searching.fit
-    monkeypatch.setattr(searching, "fit", lambda h, *given, **more: made.append(h) or real(h, *given, **more))
-    given = Search(library, windows, plain=plain).nothing
+    made, real = [], fitted_sets.fit
+    monkeypatch.setattr(fitted_sets, "fit", lambda h, *given, **more: made.append(h) or real(h, *given, **more))
+    given = FittedSets(library, windows, plain=plain).nothing
     assert not made
-    np.testing.assert_array_equal(given.residual, Search(library, windows).nothing.residual)
+    np.testing.assert_array_equal(given.residual, FittedSets(library, windows).nothing.residual)
     assert len(made) == 1

@@ -8,10 +8,10 @@ import pytest
 
 import gapcert as gc
 from gapcert.contracts.plugins.component import Context
-from gapcert_diagnosis.native.candidates import nominees
+from gapcert_diagnosis.native.candidates import native_candidates
 from gapcert_diagnosis.native.response_surface import Surface, descend, design
-from gapcert_diagnosis.native.rollouts import Motions, Scores, channels
-from gapcert_diagnosis.native.stepwise import SHIFTS, Contest, Fitted
+from gapcert_diagnosis.native.rollouts import ErrorStore, Motions, channels
+from gapcert_diagnosis.native.stepwise import SHIFTS, EngineSearch, NativeFit
 from gapcert_engines.native_model import NativeModel
 
 pytestmark = pytest.mark.contract
@@ -215,8 +215,8 @@ def test_the_starts_of_a_simulator_are_its_own(model):
 
 def test_scores_of_a_hypothesis_are_kept_by_its_digest(model, tmp_path):
     m = Motions.of(model, tosses(model, 4))
-    first = Scores(tmp_path).errors(m, model.restated({"friction": 0.3}), (0.1,))
-    store = Scores(tmp_path)
+    first = ErrorStore(tmp_path).errors(m, model.restated({"friction": 0.3}), (0.1,))
+    store = ErrorStore(tmp_path)
     assert store.errors(m, model.restated({"friction": 0.3}), (0.1,)).tobytes() == first.tobytes()
     assert store.computed == 0
     store.errors(m, model.restated({"friction": 0.31}), (0.1,))
@@ -361,13 +361,13 @@ def test_a_bound_is_kept():
 
 
 def test_a_setting_is_tried_with_the_last_number_on_both_sides(model):
-    known = nominees(model, ["contact-friction"], simulated=False)
+    known = native_candidates(model, ["contact-friction"], simulated=False)
     (friction,) = (n for n in known if n.native == "friction")
     setting = next(n for n in known if n.label == "cone = pyramidal")
-    found = Contest._variants(Fitted((friction,), model.restated({"friction": 0.2}), np.empty(0)), setting, SHIFTS)
+    found = EngineSearch._variants(NativeFit((friction,), model.restated({"friction": 0.2})), setting, SHIFTS)
     assert [m.values["friction"] for _, m in found] == pytest.approx([0.2 * np.exp(-0.2), 0.2, 0.2 * np.exp(0.2)])
     assert {m.of.cone for _, m in found} == {"pyramidal"}
-    ((_, alone),) = Contest._variants(Fitted((), model, np.empty(0)), setting, SHIFTS)
+    ((_, alone),) = EngineSearch._variants(NativeFit((), model), setting, SHIFTS)
     assert alone.values == model.values
 
 

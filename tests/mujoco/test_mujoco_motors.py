@@ -8,7 +8,7 @@ import pytest
 import gapcert as gc
 import gapcert_engines
 from gapcert.testing import multisine
-from gapcert_diagnosis.native.candidates import nominees
+from gapcert_diagnosis.native.candidates import native_candidates
 from gapcert_engines.native_model import NativeModel
 from gapcert_mujoco.config import MuJoCoConfig
 
@@ -103,7 +103,7 @@ def test_in_contact_a_gear_is_tried_as_a_gain(tmp_path):
     states = {f"{j}{end}": f"{j}.{what}" for what, end in (("position", ""), ("velocity", "_dot")) for j in ("trolley", "rope")}
     config = {"kind": "mujoco", "robot": "robot.xml", "ground": 1.0, "states": states, "inputs": {"u": "winch.ctrl"}}
     model = NativeModel(MuJoCoConfig.model_validate(config | {"period": "4 ms"}), gc.Context(folder=tmp_path))
-    (found,) = nominees(model, {"input-gain"}, simulated=False)[:1]
+    (found,) = native_candidates(model, {"input-gain"}, simulated=False)[:1]
     assert (found.key, found.native, found.factor * 16.0) == (("input-gain", "u"), "gear.winch", pytest.approx(0.8))
     x, u = np.array([[0.1, 0.4, -0.2, 0.3]]), np.array([[0.5]])
     np.testing.assert_array_equal(model.restated({"gear.winch": 16.0}).step(x, u).x, model.step(x, 0.8 * u).x)

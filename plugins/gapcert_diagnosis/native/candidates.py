@@ -34,7 +34,7 @@ _JOINT = {"damping": "viscous-friction", "frictionloss": "coulomb-friction", "co
 
 @final
 @dataclass(frozen=True)
-class Nominee:
+class NativeCandidate:
     """A native parameter, or an option of the engine with one other value, as an effect at a site.
 
     number: what its parameter is called; factor: of its value over the native one; values: native ones that a screening tries.
@@ -77,19 +77,20 @@ class Nominee:
         return float(np.clip(value, self.parameter.low, self.parameter.high))
 
 
-def nominees(model: NativeModel, effects: Collection[str], *, simulated: bool) -> tuple[Nominee, ...]:
+def native_candidates(model: NativeModel, effects: Collection[str], *, simulated: bool) -> tuple[NativeCandidate, ...]:
     """All native parameters that realise one of these effects, and the settings of the engine that are no parameters.
 
     simulated: the data are another simulator's, whose gravity may differ; that of the earth is known.
     """
-    down = max("xyz", key=lambda a: abs(_stated(model, f"gravity_{a}")))
+    stated = {p.name: p.value for p in model.parameters}
+    down = max("xyz", key=lambda a: abs(stated.get(f"gravity_{a}", 0.0)))
     known = () if simulated else (f"gravity_{down}",)
     doubted = [p for p in model.parameters if p.tolerance > 0 or not (p.name in known or p.name.startswith(_SHAPE))]
-    out = [n for p in doubted if (n := _nominee(model, p, down)).effect in effects]
+    out = [n for p in doubted if (n := _candidate(model, p, down)).effect in effects]
     return (*out, *_settings(model))
 
 
-def _nominee(model: NativeModel, p: Parameter, down: str) -> Nominee:
+def _candidate(model: NativeModel, p: Parameter, down: str) -> NativeCandidate:
     values = tried(p)
     kind, _, element = p.name.partition(".")
     if p.name in _CONTACT:
@@ -97,32 +98,27 @@ def _nominee(model: NativeModel, p: Parameter, down: str) -> Nominee:
         # The smaller of robot's and ground's friction counts where an engine has both, else their product.
         both = any(q.name == "ground" for q in model.parameters)
         times = 1.0 if p.name != "friction" or both or model.of.ground is None else model.of.ground
-        return Nominee(effect, site, p.name, number, p, times, None, values)
+        return NativeCandidate(effect, site, p.name, number, p, times, None, values)
     if kind in _JOINT and element:
-        return Nominee(_JOINT[kind], element, p.name, "coefficient", p, values=values)
+        return NativeCandidate(_JOINT[kind], element, p.name, "coefficient", p, values=values)
     if kind == "gear":
         site = next(u.name for u in model.inputs if model.backend.realises("input-gain", u.name) == p.name)
-        return Nominee("input-gain", site, p.name, "gain", p, 1 / p.value, values=values)
+        return NativeCandidate("input-gain", site, p.name, "gain", p, 1 / p.value, values=values)
     if p.name.startswith("gravity_") and not p.name.endswith(down):
-        return Nominee("gravity-tilt", p.name[-1], p.name, "acceleration", p, values=values)
-    return Nominee("parameter", p.name, p.name, "value", p, values=values)
+        return NativeCandidate("gravity-tilt", p.name[-1], p.name, "acceleration", p, values=values)
+    return NativeCandidate("parameter", p.name, p.name, "value", p, values=values)
 
 
-def _settings(model: NativeModel) -> list[Nominee]:
+def _settings(model: NativeModel) -> list[NativeCandidate]:
     """Options with other values; those that are native parameters stand above."""
     natives = {p.name.partition(".")[0] for p in model.parameters}
     joints = {"joint_damping", "frictionloss", "armature", "coulomb_friction", "joint_limits", "euler_damping", "damping"}
     out = []
     for name, values in model.of.settings().items():
-        if name in natives or name in joints:
-            continue
-        for value in values:
+        for value in values if name not in natives | joints else ():
             option = dict(value) if isinstance(value, Mapping) else {name: value}
-            out.append(
-                Nominee(
-                    "engine-setting", name, name, option=option, setting={"value": value, "was": getattr(model.of, name, None)}
-                )
-            )
+            setting = {"value": value, "was": getattr(model.of, name, None)}
+            out.append(NativeCandidate("engine-setting", name, name, option=option, setting=setting))
     return out
 
 
@@ -137,7 +133,3 @@ def tried(p: Parameter) -> tuple[float, ...]:
 
 def _scale(p: Parameter) -> float:
     return abs(p.value) * 0.2 if p.value else SCALES.get(p.unit, 1.0)
-
-
-def _stated(model: NativeModel, name: str) -> float:
-    return next((p.value for p in model.parameters if p.name == name), 0.0)

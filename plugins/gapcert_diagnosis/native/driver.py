@@ -17,9 +17,9 @@ from gapcert_diagnosis.search.criterion import agreement
 from gapcert_engines import NativeModel
 from gapcert_figures import Channel, DiagnosisFigure, Waterfall, called, state_playback
 
-from .candidates import Nominee, nominees
-from .rollouts import Motions, Scores, sensitivity
-from .stepwise import Contest, Fitted
+from .candidates import NativeCandidate, native_candidates
+from .rollouts import ErrorStore, Motions, sensitivity
+from .stepwise import EngineSearch, NativeFit
 
 WINDOW = 0.2  # s
 FEWEST = 4  # trajectories, or pieces of some, on either side
@@ -47,45 +47,43 @@ def diagnose_native(model: NativeModel, problem: DiagnosisProblem) -> Diagnosis:
 
     Rollouts start from measured states, in flight from what its first samples say, over a short window and over the longest
     horizon; a horizon longer than a trajectory ends with it. A trajectory is one voice: causes are named where trajectories
-    that a fit has not seen agree, beyond chance among so many nominees; intervals come from drawing trajectories again.
+    that a fit has not seen agree, beyond chance among so many candidates; intervals come from drawing trajectories again.
     """
     parts, horizons, seed, lap = (problem.fitted, problem.held_out), problem.horizons, problem.seed, problem.clock.lap
     fitted, held = _checked(model, parts)
     if not horizons:
         raise UsageError("diagnose: no horizon is given; name at least one in seconds, such as [0.5]")
     tell = _counted(problem.clock.emit)
-    entries = nominees(model, {e.name for e in problem.effects}, simulated=bool(parts[0].noise))
-    store = Scores(None if problem.folder is None else problem.folder / "scores")
+    entries = native_candidates(model, {e.name for e in problem.effects}, simulated=bool(parts[0].noise))
+    store = ErrorStore(None if problem.folder is None else problem.folder / "scores")
     lap("evidence")
-    contest = Contest(model, fitted, entries, sorted({problem.window or WINDOW, max(horizons)}), store, tell)
-    best = contest.found()
+    search = EngineSearch(model, fitted, entries, sorted({problem.window or WINDOW, max(horizons)}), store, tell)
+    best = search.select()
     lap("search")
     judge = _Judge(held, tuple(sorted(horizons)), store)
-    causes = tuple(_named(contest, best, c, judge, seed) for c in best.causes)
+    causes = tuple(_named(search, best, c, judge, seed) for c in best.causes)
     lap("rivals")
     gain = judge.gains(model, best.model, seed)
     lap("gain")
-    left = _left(contest.few, best.model, min(contest.horizons), seed)
-    visible = _visible(contest, best)
+    left = _left(search.few, best.model, min(search.horizons), seed)
+    visible = _visible(search, best)
     lap("leftover")
     verdict = _verdict(causes, left, judge.error(model), judge.error(best.model))
     if causes and (bad := {n: v for n, v in left.items() if v > LEFT}):
         worst = max(bad, key=lambda n: bad[n])
-        text = (
-            f"inadequate: over {min(contest.horizons):g} s, errors of {worst} are still {bad[worst]:.2g} times those of noise"
-        )
-        causes = (*causes[:-1], _flagged(causes[-1], text))
+        text = f"inadequate: over {min(search.horizons):g} s, errors of {worst} are still {bad[worst]:.2g} times those of noise"
+        causes = (*causes[:-1], replace(causes[-1], flags=(*causes[-1].flags, text)))
     return Diagnosis(
         verdict,
         causes,
-        _misfits(contest, best),
+        _misfits(search, best),
         gain,
         best.model,
-        _ties(contest, best),
+        _ties(search, best),
         None,
         None,
-        _figure(contest, judge, best),
-        negligible=tuple((*k, s) for k, s in contest.negligible.items() if k not in {c.key for c in best.causes}),
+        _figure(search, judge, best),
+        negligible=tuple((*k, s) for k, s in search.negligible.items() if k not in {c.key for c in best.causes}),
         evidence={"error over that of noisy starts": left},
         log={"trajectories fitted": len(fitted), "trajectories held out": len(held),
              "error": "mean length of the difference from measured starts", **visible},
@@ -118,7 +116,7 @@ def _counted(emit: Emit) -> Callable[..., None]:
 class _Judge:
     """Held-out rollouts."""
 
-    def __init__(self, motions: Motions, horizons: tuple[float, ...], store: Scores) -> None:
+    def __init__(self, motions: Motions, horizons: tuple[float, ...], store: ErrorStore) -> None:
         self.motions, self.horizons, self.store = motions, horizons, store
         self.names = [g.output.name for g in motions.model.groups]
 
@@ -147,23 +145,25 @@ class _Judge:
         return dict(zip(self.names, self.errors(model)[:, -1, :, 1].mean(axis=0).tolist(), strict=True))
 
 
-def _named(contest: Contest, best: Fitted, c: Nominee, judge: _Judge, seed: int) -> Cause:
-    rest = contest.without(best, c)
+def _named(search: EngineSearch, best: NativeFit, c: NativeCandidate, judge: _Judge, seed: int) -> Cause:
+    rest = search.without(best, c)
     before, after = judge.error(rest.model), judge.error(best.model)
     rival = None
-    if (r := contest.rivals.get(c.key)) is not None:
-        gained = r.scores - best.scores
-        margin = math.copysign(agreement(gained) ** 2, float(gained.mean()))
+    if (r := search.rivals.get(c.key)) is not None:
         share = 1 - judge.error(r.model) / before
-        rival = Rival(*r.causes[-1].key, share, margin, judge.means(r.model))
-    flags = []
-    if twins := contest.twins.get(c.native):
-        flags.append(f"not told apart from {', '.join(twins)}, which does the same in a contact")
-    return Cause(*c.key, _estimates(best, c, seed), 1 - after / before if before > 0 else 0.0, rival, c.native, tuple(flags),
-                 c.setting)  # fmt: skip
+        rival = Rival(*r.causes[-1].key, share, _margin(search, best, r), judge.means(r.model))
+    share, twins = 1 - after / before if before > 0 else 0.0, search.twins.get(c.native)
+    flags = (f"not told apart from {', '.join(twins)}, which does the same in a contact",) if twins else ()
+    return Cause(*c.key, _estimates(best, c, seed), share, rival, c.native, flags, c.setting)
 
 
-def _estimates(best: Fitted, c: Nominee, seed: int) -> dict[str, Estimate]:
+def _margin(search: EngineSearch, best: NativeFit, rival: NativeFit) -> float:
+    """±z² of a rival's scores over the best ones."""
+    gained = search.scores(rival.model) - search.scores(best.model)
+    return math.copysign(agreement(gained) ** 2, float(gained.mean()))
+
+
+def _estimates(best: NativeFit, c: NativeCandidate, seed: int) -> dict[str, Estimate]:
     if c.parameter is None:
         return {}
     p = c.parameter
@@ -174,33 +174,27 @@ def _estimates(best: Fitted, c: Nominee, seed: int) -> dict[str, Estimate]:
     return {c.number: Estimate(c.factor * value, p.unit, c.factor * ends[0], c.factor * ends[1])}
 
 
-def _flagged(cause: Cause, text: str) -> Cause:
-    return replace(cause, flags=(*cause.flags, text))
-
-
 def _verdict(causes: tuple[Cause, ...], left: Mapping[str, float], before: float, after: float) -> Verdict:
     if causes:
         return "causes" if after < (1 - ENOUGH) * before or max(left.values()) <= LEFT else "unexplained"
     return "nothing" if max(left.values()) <= LEFT else "unexplained"
 
 
-def _misfits(contest: Contest, best: Fitted) -> dict[str, Misfit]:
+def _misfits(search: EngineSearch, best: NativeFit) -> dict[str, Misfit]:
     """Over the short windows of the fitted part."""
-    m, short = contest.motions, (min(contest.horizons),)
-    old, new = (np.sqrt(contest.store.errors(m, f.model, short)[:, 0, :, 0].mean(axis=0)) for f in (contest.nothing, best))
+    m, short = search.motions, (min(search.horizons),)
+    old, new = (np.sqrt(search.store.errors(m, f.model, short)[:, 0, :, 0].mean(axis=0)) for f in (search.nothing, best))
     names = [g.output.name for g in m.model.groups]
     return {n: Misfit(float(a), float(b), float(s)) for n, a, b, s in zip(names, old, new, m.sigma, strict=True)}
 
 
-def _ties(contest: Contest, best: Fitted) -> tuple[tuple[tuple[str, str], ...], ...]:
+def _ties(search: EngineSearch, best: NativeFit) -> tuple[tuple[tuple[str, str], ...], ...]:
     """Sets with a rival in the place of a cause that trajectories do not put behind."""
     out = []
     for c in best.causes:
-        r = contest.rivals.get(c.key)
-        if r is not None and len(r.causes) <= len(best.causes):
-            gained = r.scores - best.scores
-            if gained.mean() < 0 or agreement(gained) ** 2 < TIE:
-                out.append(tuple(k.key for k in (*(k for k in best.causes if k is not c), r.causes[-1])))
+        r = search.rivals.get(c.key)
+        if r is not None and len(r.causes) <= len(best.causes) and _margin(search, best, r) < TIE:
+            out.append(tuple(k.key for k in (*(k for k in best.causes if k is not c), r.causes[-1])))
     return tuple(out)
 
 
@@ -235,43 +229,41 @@ def _noisy(motions: Motions, x: Array, rng: np.random.Generator) -> Array:
     return out
 
 
-def _visible(contest: Contest, best: Fitted) -> dict[str, Any]:
+def _visible(search: EngineSearch, best: NativeFit) -> dict[str, Any]:
     """Native parameters by what a change of 5 % does to short rollouts: in noise floors, not at all, or alike."""
     now = {p.name: p.value for p in best.model.parameters}
     changes = {}
-    for n in contest.entries:
+    for n in search.entries:
         if n.parameter is not None and n.option is None:
             value = now[n.native]
             new = value * (1 + STEP) if value else n.back(n.to(value) + STEP)
             changes[n.native] = best.model.restated({n.native: min(max(new, n.parameter.low), n.parameter.high)})
-    moved = sensitivity(contest.few, best.model, changes, min(contest.horizons))
+    moved = sensitivity(search.few, best.model, changes, min(search.horizons))
     size = {n: float(np.sqrt(np.mean(v**2))) for n, v in moved.items()}
     seen = {n: v for n, v in size.items() if v > UNSEEN}
     alike = []
-    names = list(seen)
-    for i, a in enumerate(names):
-        for b in names[i + 1 :]:
-            together = float(moved[a] @ moved[b]) / math.sqrt(float(moved[a] @ moved[a]) * float(moved[b] @ moved[b]))
-            if abs(together) > ALIKE:
-                alike.append(f"{a} and {b}")
-    alike += [f"{a} and {b}" for a, twins in contest.twins.items() for b in twins]
+    for a, b in itertools.combinations(seen, 2):
+        together = float(moved[a] @ moved[b]) / math.sqrt(float(moved[a] @ moved[a]) * float(moved[b] @ moved[b]))
+        if abs(together) > ALIKE:
+            alike.append(f"{a} and {b}")
+    alike += [f"{a} and {b}" for a, twins in search.twins.items() for b in twins]
     hidden = sorted(n for n, v in size.items() if v <= UNSEEN)
     out: dict[str, Any] = {"native parameters that show (noise floors per 5 %)": {n: round(v, 3) for n, v in seen.items()}}
     out |= {"native parameters that these data do not show": hidden} if hidden else {}
     return out | ({"native parameters that these data do not tell apart": alike} if alike else {})
 
 
-def _figure(contest: Contest, judge: _Judge, best: Fitted) -> DiagnosisFigure:
+def _figure(search: EngineSearch, judge: _Judge, best: NativeFit) -> DiagnosisFigure:
     """The held-out trajectory whose error before is the median, group by group; and what each cause explained."""
     grown = [best]
     while grown[0].causes:
-        grown.insert(0, contest.without(grown[0], grown[0].causes[-1]))
+        grown.insert(0, search.without(grown[0], grown[0].causes[-1]))
     m = judge.motions
-    worst = judge.errors(contest.model)[:, -1, 0, 0]
+    worst = judge.errors(search.model)[:, -1, 0, 0]
     k = int(np.argsort(worst)[len(worst) // 2])
     one = m.take([k])
     horizon = judge.horizons[-1]
-    (piece, *_), before = one.rolled(contest.model, horizon)
+    (piece, *_), before = one.rolled(search.model, horizon)
     _, after = one.rolled(best.model, horizon)
     steps = piece[2]
     channels: list[Channel] = []

@@ -12,7 +12,7 @@ import numpy as np
 from gapcert.plugin import Array
 
 RESAMPLES = 1000
-SMALLEST, LARGEST = 0.02, 0.3  # radius, in the coordinates of nominees
+SMALLEST, LARGEST = 0.02, 0.3  # radius, in the coordinates of candidates
 SHRINK = 2.5
 FLAT = 1e-6  # of the largest curvature
 WORSE = 0.02  # nats

@@ -16,6 +16,7 @@ import numpy as np
 
 from gapcert.plugin import DAMAGE, Array, Recording, UsageError, difference, npz_bytes, write_atomic
 from gapcert_diagnosis.data.initial_states import LEAD, flying, settled
+from gapcert_diagnosis.search.candidates import once
 from gapcert_engines import Group, NativeModel
 
 UNEVEN = 0.01  # of the period: how far a step of time may be off
@@ -194,7 +195,7 @@ class Motions:
 
 
 @final
-class Scores:
+class ErrorStore:
     """Errors of hypotheses, each computed once: in this process, and in a folder, from which an interrupted run goes on."""
 
     def __init__(self, folder: Path | None) -> None:
@@ -208,9 +209,7 @@ class Scores:
 
     def _one(self, motions: Motions, model: NativeModel, horizon: float) -> Array:
         key = hashlib.sha256(f"{motions.digest} {model.digest()} {horizon!r}".encode()).hexdigest()[:32]
-        if key not in self.known:
-            self.known[key] = self._loaded(key, motions, model, horizon)
-        return self.known[key]
+        return once(self.known, key, lambda: self._loaded(key, motions, model, horizon))
 
     def _loaded(self, key: str, motions: Motions, model: NativeModel, horizon: float) -> Array:
         path = None if self.folder is None else self.folder / f"{key}.npz"

@@ -14,10 +14,10 @@ from gapcert_diagnosis.fitting.fit import Fit
 from gapcert_diagnosis.results import Seen
 
 from .candidates import Candidate, Causes, Library
-from .criterion import TIE, Found, fails, keys, ranked, richer, values
-from .moves import spared
-from .stepwise import Search
-from .validation import judged
+from .criterion import TIE, Found, fails, keys, rank, richer, values, without
+from .fitted_sets import FittedSets
+from .moves import additions, spared
+from .validation import judge
 
 FAR = 3 * TIE  # rivals that are worse by more on the earlier data are not fitted again
 LIKELY = 0.3  # share of the best promise, from which a relative of a cause is fitted
@@ -34,7 +34,7 @@ class Answer:
     the settings of the model as it was given, where the search is under others.
     """
 
-    search: Search
+    search: FittedSets
     causes: Causes
     fit: Fit
     ties: tuple[Found, ...]
@@ -60,83 +60,82 @@ class Answer:
         return self.search.nothing if self.plain is None else self.plain
 
 
-def answered(search: Search, found: Found, windows: Windows) -> Answer:
+def answered(search: FittedSets, found: Found, windows: Windows) -> Answer:
     """The set of a search, fitted to all windows, against its rivals; of sets that explain as much, the simplest."""
     hold = search.windows.measured.hold
-    whole = Search(search.library, windows if hold is None else windows.with_hold(hold), search.progress)
+    whole = FittedSets(search.library, windows if hold is None else windows.with_hold(hold), search.progress)
     whole.cautious = search.cautious
     later = windows.guard()[1]
     found = _richer(search, whole, found, later)
     causes = found[0]
-    last = whole.moved(causes, found[1])
+    last = whole.fit_from(causes, found[1])
     rivals = {c.key: _alternatives(search, whole, found, c) for c in causes}
     ties = [t for t in _ties(whole, (causes, last), rivals) if not _refuted(search, t[0], found, later)]
     simplest = _simplest(whole, [(causes, last), *ties])
     if simplest[0] == causes:
         return Answer(whole, causes, last, tuple(ties), rivals, search.negligible)
-    (new,) = (c for c in simplest[0] if c.key not in keys(causes))
-    (old,) = (c for c in causes if c.key not in keys(simplest[0]))
-    rivals[new.key] = tuple(ranked([(causes, last), *(f for f in rivals.pop(old.key) if f[0] != simplest[0])]))
+    (new,), (old,) = without(simplest[0], causes), without(causes, simplest[0])
+    rivals[new.key] = tuple(rank([(causes, last), *(f for f in rivals.pop(old.key) if f[0] != simplest[0])]))
     others = [(causes, last), *(t for t in ties if t[0] != simplest[0])]
     named = tuple(new if c is old else c for c in causes)
     return Answer(whole, named, simplest[1], tuple(others), rivals, search.negligible)
 
 
-def _refuted(search: Search, causes: Causes, found: Found, later: Windows) -> bool:
+def _refuted(search: FittedSets, causes: Causes, found: Found, later: Windows) -> bool:
     """Is a rough fit, made to the earlier windows, plainly further off on the later ones than what was found?"""
     known = search.known(causes)
     if known is None or not found[1].rough:
         return False
-    return fails(judged(known, later), float(judged(found[1], later).chi.max()))
+    return fails(judge(known, later), float(judge(found[1], later).chi.max()))
 
 
-def _richer(search: Search, whole: Search, found: Found, later: Windows) -> Found:
+def _richer(search: FittedSets, whole: FittedSets, found: Found, later: Windows) -> Found:
     """With a law in the place of one that it contains, where all windows ask for it and the earlier ones nearly did."""
     for c in found[0]:
         for e in search.library.candidates:
             new = tuple(e if k is c else k for k in found[0])
-            if e.site != c.site or not search.library.contains(e.effect.name, c.effect.name) or keys(new) == keys(found[0]):
+            if not search.library.within(c, e) or keys(new) == keys(found[0]):
                 continue
             known = search.known(new)
             if known is None or search.better(known, found[1]) < -TIE or _refuted(search, new, found, later):
                 continue
-            fits = whole.moved(new, known), whole.moved(*found)
+            fits = whole.fit_from(new, known), whole.fit_from(*found)
             if whole.better(*fits) > richer(fits, whole.cautious) and whole.matters((new, fits[0])):
                 return new, known
     return found
 
 
-def _simplest(search: Search, found: Sequence[Found]) -> Found:
+def _simplest(search: FittedSets, found: Sequence[Found]) -> Found:
     """Of sets that explain as much: fewest numbers, plausible ones, a score that is plainly the best, the contract's order."""
     library = search.library
     fewest = min(library.simplicity(s)[0] for s, _ in found)
-    best = ranked([f for f in found if library.simplicity(f[0])[0] == fewest], search.cautious)
+    best = rank([f for f in found if library.simplicity(f[0])[0] == fewest], search.cautious)
     best = [f for f in best if not any(_implausible(library, c, f[1]) for c in f[0])] or best
     even = [f for f in best if search.better(best[0][1], f[1]) < EVEN]
     return min(even, key=lambda f: library.simplicity(f[0]))
 
 
-def _alternatives(search: Search, whole: Search, found: Found, c: Candidate) -> tuple[Found, ...]:
+def _alternatives(search: FittedSets, whole: FittedSets, found: Found, c: Candidate) -> tuple[Found, ...]:
     """The best sets with something else in the place of c, fitted to all windows; laws that contain c are no rivals of it."""
-    rest = tuple(k for k in found[0] if k is not c)
+    rest = without(found[0], (c,))
     base = rest, search.fit(rest, found)
     # What c explains is told beside this fit: from here it has a shorter way than from the fit of all causes.
-    whole.moved(rest, base[1])
-    tried = search.additions(rest, base, instead=c, hope=-np.inf)
+    whole.fit_from(rest, base[1])
+    tried = additions(search, base, instead=c, hope=-np.inf)
     known = {keys(f[0]) for f in tried} | (set() if search.library.measured.exact else search.lost)
     kin = [(s, search.fit(s, base)) for s in _relatives(search, base, c) if keys(s) not in known]
     # Fits to short windows are not compared with those to long ones: the best of each.
     short = bool(tried) and all(keys(s) in search.lost for s, _ in tried)
-    groups = [ranked(g, search.cautious) for g in ((tried, kin) if short else ([*tried, *kin],))]
+    groups = [rank(g, search.cautious) for g in ((tried, kin) if short else ([*tried, *kin],))]
     near = [f for g in groups for i, f in enumerate(g) if i == 0 or search.better(found[1], f[1]) < FAR]
-    return tuple(ranked([(s, whole.moved(s, f)) for s, f in near], search.cautious))
+    return tuple(rank([(s, whole.fit_from(s, f)) for s, f in near], search.cautious))
 
 
-def _relatives(search: Search, base: Found, c: Candidate) -> list[Causes]:
+def _relatives(search: FittedSets, base: Found, c: Candidate) -> list[Causes]:
     """Laws of the same family, and those that are the same on some data."""
     family, contains, same = c.effect.family, search.library.contains, c.effect.equivalent
     out: dict[tuple[str, str], Causes] = {}
-    for promised in search.promised(base, c):
+    for promised in search.promises(base, c):
         best = max((s.gain for s in promised), default=0.0)
         for s in promised:
             (e, *more) = s.move
@@ -147,14 +146,14 @@ def _relatives(search: Search, base: Found, c: Candidate) -> list[Causes]:
     return list(out.values())
 
 
-def _ties(search: Search, last: Found, rivals: Mapping[tuple[str, str], tuple[Found, ...]]) -> list[Found]:
+def _ties(search: FittedSets, last: Found, rivals: Mapping[tuple[str, str], tuple[Found, ...]]) -> list[Found]:
     """Sets whose score is about the same: a law that contains another, or is contained, is charged for its numbers already."""
     causes, now = last
     out = []
     for key, found in rivals.items():
         (c,) = (k for k in causes if k.key == key)
         for f in found:
-            (e,) = (k for k in f[0] if k.key not in keys(causes))
+            (e,) = without(f[0], causes)
             alone = spared(search, causes, f[0])
             least = richer([now, f[1]], search.cautious, alone) if search.library.related(c, e) else TIE
             if search.better(now, f[1]) < least:
@@ -164,7 +163,7 @@ def _ties(search: Search, last: Found, rivals: Mapping[tuple[str, str], tuple[Fo
 
 def _implausible(library: Library, c: Candidate, fitted: Fit) -> dict[str, tuple[float, float]]:
     """The numbers of a cause that lie outside of what is plausible, with its limits."""
-    stated = None if library.extension(c).frees is None else library.off(c)[0]
+    stated = None if (freed := library.freed(c)) is None else freed.value
     if stated == 0:
         return {}
     known, scales = values(fitted), library.scales(c)
@@ -198,11 +197,12 @@ def flags(library: Library, c: Candidate, fitted: Fit) -> tuple[str, ...]:
     return tuple(out)
 
 
-def smallest(search: Search) -> tuple[Seen, ...]:
+def smallest(search: FittedSets) -> tuple[Seen, ...]:
     """What each effect would have had to be, to be named in these data."""
     library, out = search.library, []
-    for c, row in search.screen.least(search.nothing, library.threshold):
-        low, high = library.bounds(c)
-        if (row >= low).all() and (row <= high).all():
+    (table,) = search.screen.tables([(search.nothing, 1)])
+    for c in library.candidates:
+        (low, high), row = library.bounds(c), table.least(c, library.threshold)
+        if row is not None and (row >= low).all() and (row <= high).all():
             out.append(Seen(*c.key, c.effect.parameters[0].name, float(row[0]), library.units(c)[0]))
     return tuple(out)

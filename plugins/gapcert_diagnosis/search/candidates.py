@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import final
+from typing import TypeVar, final
 
 import numpy as np
 
@@ -50,6 +50,15 @@ class Candidate:
 
 
 Causes = tuple[Candidate, ...]
+K = TypeVar("K")
+V = TypeVar("V")
+
+
+def once(known: dict[K, V], key: K, make: Callable[[], V]) -> V:
+    """What is kept under a key, made the first time."""
+    if key not in known:
+        known[key] = make()
+    return known[key]
 
 
 @final
@@ -95,12 +104,11 @@ class Library:
     def _roughened(self, c: Candidate, found: Mapping[str, float]) -> Dataset:
         """With a noise floor of at least what the effect does to its channel over the range of the motion."""
         x, u = (np.linspace(a.min(axis=0), a.max(axis=0), SWEPT) for a in self._path)
-        plain, rough = (m.output(x, u) for m in (self.model, self.extended((c,), found)))
-        moved = difference(self.model.outputs, rough, plain)[:, list(self.measured.columns)]
+        plain, acting = (m.output(x, u) for m in (self.model, self.extended((c,), found)))
+        moved = difference(self.model.outputs, acting, plain)[:, list(self.measured.columns)]
         added, known = np.sqrt(np.mean(moved**2, axis=0)), self.measured.rough if self.measured.rough.size else 0.0
-        return replace(
-            self.measured, sigma=np.maximum(self.measured.sigma, added), rough=np.maximum(known, np.abs(moved).max(axis=0))
-        )
+        sigma, rough = np.maximum(self.measured.sigma, added), np.maximum(known, np.abs(moved).max(axis=0))
+        return replace(self.measured, sigma=sigma, rough=rough)
 
     def _everywhere(self) -> list[Causes]:
         """The same law at all coordinates, or at all inputs: joints and drives of one make share their faults."""
@@ -109,29 +117,36 @@ class Library:
 
     @property
     def threshold(self) -> float:
-        """The fall in score that a cause must bring: more rivals tried, more needed."""
-        return 12 + 2 * math.log(max(1, len(self.candidates)))
+        """The fall in score that a cause must bring."""
+        return self.charge()
+
+    def charge(self, settings: int = 0) -> float:
+        """The same for one that was chosen among so many settings as well: more rivals tried, more needed."""
+        return 12 + 2 * math.log(max(1, len(self.candidates) + settings))
 
     def extension(self, c: Candidate) -> Extension:
-        if c.key not in self._extensions:
-            self._extensions[c.key] = c.effect.extension(c.site, self.model)
-        return self._extensions[c.key]
+        return once(self._extensions, c.key, lambda: c.effect.extension(c.site, self.model))
+
+    def freed(self, c: Candidate) -> Parameter | None:
+        """The parameter of the model that a candidate frees, as it is stated; None of a law, which has numbers of its own."""
+        name = self.extension(c).frees
+        return None if name is None else next(p for p in self.model.parameters if p.name == name)
 
     def loosened(self, c: Candidate) -> str | None:
         """The parameter of which a candidate lifts the tolerance: it is among the free numbers of every hypothesis."""
-        freed = self.extension(c).frees
-        return next((p.name for p in self.model.parameters if p.name == freed and p.tolerance > 0), None)
+        freed = self.freed(c)
+        return None if freed is None or freed.tolerance <= 0 else freed.name
 
     def doubted(self, c: Candidate) -> float | None:
         """The scale on which a candidate frees a parameter that has no tolerance, but that the model doubts."""
-        freed = self.extension(c).frees
-        if freed is None or self.loosened(c) or (freed in EARTH and not self.measured.exact):
+        freed = self.freed(c)
+        if freed is None or freed.tolerance > 0 or (freed.name in EARTH and not self.measured.exact):
             return None
-        return self.model.doubts.get(freed)
+        return self.model.doubts.get(freed.name)
 
     def off(self, c: Candidate) -> list[float]:
         """The numbers at which a candidate changes nothing."""
-        return [p.off for p in c.effect.parameters] if self.extension(c).frees is None else [self._stated(c).value]
+        return [p.off for p in c.effect.parameters] if (freed := self.freed(c)) is None else [freed.value]
 
     def contains(self, name: str, other: str) -> bool:
         """Is the law `other` a special case of the law `name`?"""
@@ -150,10 +165,7 @@ class Library:
 
     def scales(self, c: Candidate) -> dict[str, float]:
         """Root mean squares, peaks and ranges of what a site is measured in, and the times of the data."""
-        key = (c.effect.site, c.site)
-        if key not in self._scales:
-            self._scales[key] = _scales(self, c, *self._path)
-        return self._scales[key]
+        return once(self._scales, (c.effect.site, c.site), lambda: _scales(self, c, *self._path))
 
     @cached_property
     def moved(self) -> tuple[Array, Array]:
@@ -169,39 +181,36 @@ class Library:
 
     def starts(self, c: Candidate) -> Array:
         """First values (s, p) of a candidate's parameters."""
-        if (scale := self.doubted(c)) is not None:
-            return np.array([[self._stated(c).value + s * scale] for s in DOUBTS])
-        if self.extension(c).frees is not None:
-            return np.array([[self._stated(c).value]])
+        if (freed := self.freed(c)) is not None:
+            scale = self.doubted(c)
+            return np.array([[freed.value + s * scale] for s in DOUBTS] if scale is not None else [[freed.value]])
         return np.array(c.effect.grid(self.scales(c)), dtype=np.float64).reshape(-1, len(c.effect.parameters))
 
     def amplitude(self, c: Candidate) -> int | None:
         """Which parameter the effect is linear in."""
-        names = [p.name for p in c.effect.parameters]
         if self.doubted(c) is not None:
             return 0
-        return None if c.effect.amplitude is None else names.index(c.effect.amplitude)
+        return None if c.effect.amplitude is None else [p.name for p in c.effect.parameters].index(c.effect.amplitude)
 
     def names(self, c: Candidate) -> tuple[str, ...]:
         """What a candidate's parameters are called in the extended model."""
-        freed = self.extension(c).frees
-        return (freed,) if freed is not None else tuple(p.name for p in self.extension(c).parameters)
+        return tuple(p.name for p in self._numbers(c))
 
     def units(self, c: Candidate) -> tuple[str, ...]:
-        if self.extension(c).frees is not None:
-            return (self._stated(c).unit,)
-        return tuple(p.unit for p in self.extension(c).parameters)
+        return tuple(p.unit for p in self._numbers(c))
+
+    def _numbers(self, c: Candidate) -> Sequence[Parameter]:
+        return self.extension(c).parameters if (freed := self.freed(c)) is None else (freed,)
 
     def bounds(self, c: Candidate) -> tuple[Array, Array]:
         """(low, high) of a candidate's parameters, in their units."""
-        if (doubt := self.doubted(c)) is not None:
-            stated = self._stated(c)
+        stated, doubt = self.freed(c), self.doubted(c)
+        if stated is not None and doubt is not None:
             ends = stated.value - FAR * doubt, stated.value + FAR * doubt
             return np.array([max(ends[0], stated.low)]), np.array([min(ends[1], stated.high)])
         scale = np.array([p.scale(self.scales(c)) for p in c.effect.parameters])
         low, high = (np.array([getattr(p, n) for p in c.effect.parameters]) * scale for n in ("low", "high"))
-        if self.extension(c).frees is not None:
-            stated = self._stated(c)
+        if stated is not None:
             low, high = np.sort([stated.value * low / scale, stated.value * high / scale], axis=0)
             if stated.low < 0:  # A place, or a component, may have either sign.
                 low = np.minimum(low, stated.value - FAR * stated.tolerance)
@@ -222,10 +231,7 @@ class Library:
         return tuple(n for c in causes if self.extension(c).dry_friction is not None for n in self.names(c))
 
     def hypothesis(self, causes: Causes) -> Hypothesis:
-        key = tuple(c.key for c in causes)
-        if key not in self._made:
-            self._made[key] = self._hypothesis(causes)
-        return self._made[key]
+        return once(self._made, tuple(c.key for c in causes), lambda: self._hypothesis(causes))
 
     def _hypothesis(self, causes: Causes) -> Hypothesis:
         model = self.extended(causes, {})
@@ -238,8 +244,8 @@ class Library:
                 rows.append((p.name, p.value, *near, NUISANCE_STEP * p.tolerance, p.tolerance / SIGMAS))
         for c in causes:
             low, high = (b.tolist() for b in self.bounds(c))
-            if self.extension(c).frees is not None:
-                stated, doubt = self._stated(c), self.doubted(c)
+            if (stated := self.freed(c)) is not None:
+                doubt = self.doubted(c)
                 step = NUISANCE_STEP * (stated.tolerance if doubt is None else DOUBTS[-1] * doubt)
                 rows.append((stated.name, stated.value, low[0], high[0], step, math.inf))
                 continue
@@ -251,9 +257,7 @@ class Library:
     def extended(self, causes: Causes, values: Mapping[str, float]) -> Model:
         """The model with the causes, their parameters at `values` (default: off), and its own where these were fitted too."""
         key = tuple(c.key for c in causes), tuple(sorted(values.items()))
-        if key not in self._models:
-            self._models[key] = self._extended(causes, values)
-        return self._models[key]
+        return once(self._models, key, lambda: self._extended(causes, values))
 
     def _extended(self, causes: Causes, values: Mapping[str, float]) -> Model:
         extensions = []
@@ -274,9 +278,7 @@ class Library:
         }
         if not loose:
             return self.model
-        if (key := tuple(loose.items())) not in self._restatements:
-            self._restatements[key] = _restated(self.model, loose)
-        return self._restatements[key]
+        return once(self._restatements, tuple(loose.items()), lambda: _restated(self.model, loose))
 
     def shared(self, c: Candidate) -> Model:
         """A model in which a candidate is off, and the same law at all other sites too: one program serves all of them."""
@@ -284,13 +286,8 @@ class Library:
             return self.model
         return self.hypothesis(tuple(k for k in self.candidates if k.effect.name == c.effect.name)).model
 
-    def _stated(self, c: Candidate) -> Parameter:
-        return next(p for p in self.model.parameters if p.name == self.extension(c).frees)
-
 
 def _step(p: EffectParameter, scale: float) -> float:
-    if p.step:
-        return p.step * scale
     return scale * (p.step or STEP * min(abs(s - p.off) if not p.dimension else abs(s) for s in p.starts))
 
 

@@ -16,20 +16,20 @@ squared residual of a channel over that of noise, G the charge for one more caus
 | `fails`        | a fit on later data, its due     | χ > LATE times what is due                    | later data     |
 | `setting_pays` | a fit under another setting      | χ falls by MUCH, ΔS > charge                  | settings       |
 
-Where a search is cautious and the closer of two fits is rough, what is left is no noise that samples could be counted by: ΔS is
-at most z² there, `rough_charge` stands for G, and SURE² or SPARED for RICHER. Beside these, `effect_size` says which causes are
-too small to be named, and `native.stepwise` what pays for an engine, whose trajectories are the voices.
+Where a search is cautious and the closer of two fits is rough, ΔS is at most z², `rough_charge` stands for G, and SURE² or
+SPARED for RICHER. `effect_size` says which causes are too small to be named, `native.stepwise` what pays for an engine.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import TypeVar
 
 import numpy as np
 
 from gapcert.plugin import Array
-from gapcert_diagnosis.fitting.fit import Fit
+from gapcert_diagnosis.fitting.fit import Fit, Hypothesis
 
 from .candidates import Causes, Library
 
@@ -54,6 +54,7 @@ MUCH = 0.5  # least share of the squared residual that a setting explains: a sta
 
 Keys = frozenset[tuple[str, str]]
 Found = tuple[Causes, Fit]
+T = TypeVar("T")
 
 
 def better(new: Fit, old: Fit, cautious: bool = False) -> float:
@@ -177,12 +178,16 @@ def closest(fits: Sequence[Fit]) -> Fit:
     return min(fits, key=lambda f: float(f.chi.sum()))
 
 
-def ranked(found: Sequence[Found], cautious: bool = False) -> list[Found]:
-    """Best score first, all as the closest fit has it."""
-    if not found:
-        return []
-    best = closest([f for _, f in found])
-    return sorted(found, key=lambda f: f[1].score(best, cautious and best.rough))
+def scores(fits: Sequence[Fit], cautious: bool) -> list[float]:
+    """All as the closest of them has it."""
+    best = closest(fits) if fits else None
+    return [f.score(best, cautious and best.rough) for f in fits] if best else []
+
+
+def rank(found: Sequence[tuple[T, Fit]], cautious: bool = False) -> list[tuple[T, Fit]]:
+    """Best score first."""
+    marks = scores([f for _, f in found], cautious)
+    return [f for _, f in sorted(zip(marks, found, strict=True), key=lambda p: p[0])]
 
 
 def rough_charge(library: Library, causes: Causes, before: Causes) -> float:
@@ -204,41 +209,20 @@ def values(fitted: Fit) -> dict[str, float]:
     return dict(zip(fitted.hypothesis.names, map(float, fitted.theta), strict=True))
 
 
+def numbers(h: Hypothesis, known: Mapping[str, float]) -> Array:
+    """Numbers (p,) of a hypothesis: those that are known, and the others as they are stated."""
+    return np.array([known.get(n, v) for n, v in zip(h.names, h.value.tolist(), strict=True)])
+
+
 def keys(causes: Causes) -> Keys:
     return frozenset(c.key for c in causes)
 
 
-def lightest(library: Library, causes: Causes, fitted: Fit) -> tuple[Causes, Array]:
-    """(causes, shares): the least needed first, and of the squared residual what these first ones together keep away.
-
-    To second order, from the covariance of what is off: dᵀ Σ⁻¹ d / Σ r².
-    """
-    names, whole = list(fitted.hypothesis.names), max(float(np.sum(fitted.residual**2)), 1e-300)
-    rows, gaps = [], []
-    for c in causes:
-        k, off = library.amplitude(c), library.off(c)
-        own = range(len(off)) if k is None else (k,)
-        rows.append([names.index(library.names(c)[i]) for i in own])
-        gaps.append([fitted.theta[r] - off[i] for r, i in zip(rows[-1], own, strict=True)])
-
-    def share(some: Sequence[int]) -> float:
-        r, d = (np.concatenate([a[i] for i in some]) for a in (rows, gaps))
-        return float(d @ np.linalg.pinv(fitted.covariance[np.ix_(r, r)], hermitian=True) @ d) / whole
-
-    order = sorted(range(len(causes)), key=lambda i: share([i]))
-    return tuple(causes[i] for i in order), np.array([share(order[: i + 1]) for i in range(len(order))])
+def without(causes: Causes, others: Causes) -> Causes:
+    """Those that are not among the others."""
+    return tuple(c for c in causes if c.key not in keys(others))
 
 
 def named(causes: Causes) -> str:
     """`coulomb-friction at q + viscous-friction at q`."""
     return " + ".join(f"{effect} at {site}" for effect, site in (c.key for c in causes)) or "no cause"
-
-
-def so_far(fits: Mapping[Keys, Found]) -> dict[str, str]:
-    """The set with the least error on the fitted windows, and the share of it that is left: what one sees meanwhile."""
-    tried = [found for found in fits.values() if found[0]]
-    before = float(fits[frozenset()][1].chi.sum()) if frozenset() in fits else 0.0
-    if not tried or before <= 0:
-        return {}
-    causes, least = min(tried, key=lambda found: float(found[1].chi.sum()))
-    return {"best": named(causes), "error left": f"{math.sqrt(float(least.chi.sum()) / before):.0%}"}

@@ -30,37 +30,29 @@ def share(screen: Screen, c: Candidate, values: Mapping[str, float]) -> float:
     library = screen.library
     if (doubt := library.doubted(c)) is not None:
         return abs(values[library.names(c)[0]] - library.off(c)[0]) / doubt
-    if (freed := library.loosened(c)) is not None:
-        stated = next(p for p in library.model.parameters if p.name == freed)
-        return math.inf if abs(values[freed] - stated.value) > stated.tolerance else 0.0
-    push = screen.pushed(c, np.array([[values[n] for n in library.names(c)]]))
+    if (freed := library.freed(c)) is not None:
+        return math.inf if abs(values[freed.name] - freed.value) > freed.tolerance else 0.0
+    push = screen.push_at(c, values)
     if push.state is None:
         channel = [s.name for s in screen.windows.measured.channels].index(c.site)
         shown = push.output if push.output is not None else np.zeros(1)
         return _most(shown[:, :, channel]) / float(screen.windows.measured.spread[channel])
-    return _most(_force(screen, c, push.state[..., 0])) / _effort(screen, c)
+    moved = push.state[..., 0]
+    if c.effect.site == "coordinate":
+        return _most(_force(screen, c, moved)) / library.scales(c)["force"]
+    column, effort = screen.once(("felt", c.site), lambda: _felt(screen, c))
+    return _most(moved[..., column]) / float(effort)
 
 
 def _force(screen: Screen, c: Candidate, moved: Array) -> Array:
-    """Of one-step differences (W, S, nx): the force at the site that makes them; at an input, the state that feels it most."""
-    if c.effect.site == "coordinate":
-        response = screen.once(("sliding", c.site), lambda: sliding(screen.library.model, c.site, *_states(screen)))
-        v = velocity(screen.library.model, c.site, response)
-        return np.asarray(moved[..., v] / response[:, v].reshape(moved.shape[:2]))
-    return np.asarray(moved[..., _felt(screen, c)[0]])
-
-
-def _effort(screen: Screen, c: Candidate) -> float:
-    return screen.library.scales(c)["force"] if c.effect.site == "coordinate" else _felt(screen, c)[1]
+    """The force at a coordinate that makes one-step differences (W, S, nx)."""
+    response = screen.once(("sliding", c.site), lambda: sliding(screen.library.model, c.site, *_states(screen)))
+    v = velocity(screen.library.model, c.site, response)
+    return np.asarray(moved[..., v] / response[:, v].reshape(moved.shape[:2]))
 
 
 def _felt(screen: Screen, c: Candidate) -> tuple[int, float]:
     """(column, root mean square) of what the input at the site does to the state in one step, where it does most."""
-    found: tuple[int, float] = screen.once(("felt", c.site), lambda: _pulled(screen, c))
-    return found
-
-
-def _pulled(screen: Screen, c: Candidate) -> tuple[int, float]:
     model = screen.library.model
     x, u = _states(screen)
     without = np.where([s.name == c.site for s in model.inputs], 0.0, u)
@@ -71,10 +63,9 @@ def _pulled(screen: Screen, c: Candidate) -> tuple[int, float]:
 
 
 def _states(screen: Screen) -> tuple[Array, Array]:
-    path = screen.path
-    x, u = path.x[:, path.lead :], path.u[:, path.lead :]
-    x = x.reshape(-1, x.shape[-1])
-    return x, u.reshape(len(x), u.shape[-1])
+    x, u = (a[:, screen.path.lead :] for a in (screen.path.x, screen.path.u))
+    rows = x.shape[0] * x.shape[1]
+    return x.reshape(rows, x.shape[-1]), u.reshape(rows, u.shape[-1])
 
 
 def _most(a: Array) -> float:

@@ -15,10 +15,11 @@ from gapcert.plugin import Effect, Model, UsageError, Variant
 from gapcert_diagnosis.data.dataset import Windows
 from gapcert_diagnosis.fitting.fit import Fit, fit, stepped
 
-from .candidates import Causes, Library
-from .criterion import FALL, PLAIN, QUIET, SURE, Found, better, noise, setting_pays, values
-from .stepwise import CLOSE, SECOND, Search
-from .validation import confirmed, searched
+from .candidates import Causes, Library, once
+from .criterion import FALL, PLAIN, QUIET, SURE, Found, better, noise, numbers, setting_pays, values, without
+from .fitted_sets import SECOND, FittedSets
+from .moves import CLOSE, additions
+from .validation import confirms, search_windows
 
 SCREENED = 4_000  # measured values on which all settings are tried
 FINALISTS = 2
@@ -30,6 +31,7 @@ STILL = 1e-9  # of the squared residual: how friction is solved changes nothing 
 TINY = 1e-12  # noise floors squared: data of a simulator are hit exactly
 
 Tried = tuple[Variant, Causes, Fit]
+Numbers = dict[str, float]
 
 
 @final
@@ -48,209 +50,176 @@ class Setting:
 class Settled:
     """What a search found under the settings that explain the data best."""
 
-    search: Search
+    search: FittedSets
     found: Found
     settings: tuple[Setting, ...]
 
 
 def across(library: Library, effects: Sequence[Effect], windows: Windows, tell: Callable[..., None]) -> Settled:
-    """The search of `guard.searched`, and again under settings with which the score is better.
+    """The search of `validation.search_windows`, and again under settings with which the score is better.
 
     A setting has no number, but was chosen among as many as there are: it pays as a cause does, unless it takes the place of
     causes, which pay for their numbers already.
     """
+    under = _Settings(library, effects, windows, tell)
     variants = library.model.variants()
-    earlier = windows.guard()[0]
-    if not variants or (plain := fit(library.hypothesis(()), earlier)).chi.max() < QUIET:
-        return Settled(*searched(library, windows, tell, plain if variants else None), ())
-    return _Across(effects, windows, earlier, tell).settled(library, variants, plain)
+    if not variants or (plain := fit(library.hypothesis(()), under.earlier)).chi.max() < QUIET:
+        return Settled(*search_windows(library, windows, tell, plain if variants else None), ())
+    alone = under.rank(variants, ())
+    if (at_once := under.at_once(variants, alone, plain)) is not None:
+        return at_once
+    settled = Settled(*search_windows(library, windows, tell, plain), ())
+    while len(settled.settings) < MOST and (new := under.better(settled, alone, len(variants))) is not None:
+        settled, under = new, _Settings(new.search.library, effects, windows, tell)
+        done = {s.variant.setting for s in new.settings}
+        variants = [v for v in under.library.model.variants() if v.setting not in done]
+        alone = under.rank(variants, ())
+    return settled
 
 
 @final
-class _Across:
-    def __init__(self, effects: Sequence[Effect], windows: Windows, earlier: Windows, tell: Callable[..., None]) -> None:
-        self.effects, self.windows, self.earlier, self.tell = effects, windows, earlier, tell
-        self.later = windows.guard()[1]
-        self._bare: dict[tuple[int, int], Library] = {}
+class _Settings:
+    """The settings of the model of a library: what causes make of some of the windows under each."""
+
+    def __init__(self, library: Library, effects: Sequence[Effect], windows: Windows, tell: Callable[..., None]) -> None:
+        self.library, self.effects, self.windows, self.tell = library, effects, windows, tell
+        self.earlier, self.later = windows.guard()
+        self._bare: dict[int, Library] = {}
         self._fits: dict[tuple[object, ...], Fit] = {}
         self._near: dict[tuple[object, ...], list[tuple[Variant, tuple[Variant, Fit, Fit] | None]]] = {}
-        count = max(1, round(len(earlier) * min(1.0, SCREENED / earlier.y.size)))
-        self.few = earlier.take(np.unique(np.linspace(0, len(earlier) - 1, count).astype(np.intp)))
+        count = max(1, round(len(self.earlier) * min(1.0, SCREENED / self.earlier.y.size)))
+        self.few = self.earlier.take(np.unique(np.linspace(0, len(self.earlier) - 1, count).astype(np.intp)))
 
-    def settled(self, library: Library, variants: Sequence[Variant], plain: Fit) -> Settled:
-        alone = self.ranked(library, variants, ())
-        if (at_once := self.at_once(library, variants, alone, plain)) is not None:
-            return at_once
-        search, found = searched(library, self.windows, self.tell, plain)
-        settings: tuple[Setting, ...] = ()
-        while len(settings) < MOST:
-            new = self.better(library, found, self.groups(library, alone, found), len(variants))
-            if new is None:
-                break
-            search, found, setting = new
-            settings, library = (*settings, setting), search.library
-            done = {s.variant.setting for s in settings}
-            variants = [v for v in library.model.variants() if v.setting not in done]
-            alone = self.ranked(library, variants, ())
-        return Settled(search, found, settings)
-
-    def at_once(self, library: Library, variants: Sequence[Variant], alone: Sequence[Tried], plain: Fit) -> Settled | None:
+    def at_once(self, variants: Sequence[Variant], alone: Sequence[Tried], plain: Fit) -> Settled | None:
         """A setting that leaves nothing, alone or, in data of a simulator, beside one of the likeliest causes.
 
         Where both are missing, a search without the setting piles up stand-ins for it.
         """
-        if (setting := self.whole(library, alone, plain)) is not None:
-            return Settled(*self.under(library, setting.variant.model), (setting,))
-        if not library.measured.exact:
+        if (setting := self.whole(alone, plain)) is not None:
+            return Settled(*self.under(setting.variant), (setting,))
+        if not self.library.measured.exact:
             return None
-        search = Search(library, self.earlier, self.tell, plain)
-        likely = search.additions((), ((), search.nothing))[:FINALISTS]
+        sets = FittedSets(self.library, self.earlier, self.tell, plain)
+        likely = additions(sets, ((), sets.nothing))[:FINALISTS]
         if exact := [f for f in likely if f[1].chi.max() < QUIET]:
             # Beside a setting a simpler law may do: two numbers that are one, say.
-            likely = [f for e in exact for f in _simpler(search, e)]
+            likely = [f for e in exact for f in _simpler(sets, e)]
         for causes, now in likely if all(f.chi.max() >= QUIET for _, f in likely) else ():
-            tried = self.ranked(library, variants, causes, values(now))
-            if (setting := self.whole(library, tried, now)) is not None:
-                return Settled(*self.under(library, setting.variant.model), (setting,))
+            tried = self.rank(variants, causes, values(now))
+            if (setting := self.whole(tried, now)) is not None:
+                return Settled(*self.under(setting.variant), (setting,))
         return None
 
-    def whole(self, library: Library, tried: Sequence[Tried], before: Fit) -> Setting | None:
+    def whole(self, tried: Sequence[Tried], before: Fit) -> Setting | None:
         """The first of those that were tried, if nothing is left with it."""
         for variant, causes, first in tried[:1]:
-            if not library.measured.exact and first.chi.max() > PLAIN:
+            if not self.library.measured.exact and first.chi.max() > PLAIN:
                 return None
-            found = self.fitted(library, variant.model, causes, self.earlier, values(first))
-            if found.chi.max() < QUIET and self.pays(found, before, self.charge(library, len(tried)), fewer=False):
-                return _setting(library, tried)
+            found = self.fitted(variant.model, causes, self.earlier, values(first))
+            if found.chi.max() < QUIET and self.pays(found, before, self.library.charge(len(tried)), fewer=False):
+                return _setting(self.library, tried, variant)
         return None
 
-    def under(self, library: Library, model: Model) -> tuple[Search, Found]:
-        return searched(Library(model, library.measured, self.effects), self.windows, self.tell)
+    def under(self, variant: Variant) -> tuple[FittedSets, Found]:
+        """The search under a setting."""
+        return search_windows(Library(variant.model, self.library.measured, self.effects), self.windows, self.tell)
 
-    def groups(self, library: Library, alone: Sequence[Tried], found: Found) -> list[list[Tried]]:
+    def groups(self, alone: Sequence[Tried], found: Found) -> list[list[Tried]]:
         """Settings alone, in the place of one of several causes, and beside all where these leave something.
 
         Without noise any may decide. Else one counts that the windows feel, or that does nothing before a cause is there; in
         the place of a cause, about as much as they feel the cause.
         """
-        causes, now = found
-        exact, start = library.measured.exact, values(now)
+        (causes, now), exact, start = found, self.library.measured.exact, values(found[1])
         felt, size = [(v, 0.0) for v, _, _ in alone], 0.0
         if not exact:
-            felt = [
-                (v, float(np.sum((f.residual - own.residual) ** 2)))
-                for v, f, own in self.near(library, [v for v, _ in felt], (), {})
-            ]
-            size = float(np.sum(self.fitted(library, library.model, (), self.few, {}).residual ** 2))
-        whole = self.fitted(library, library.model, causes, self.few, start) if len(causes) > 1 else now
+            near = self.near([v for v, _ in felt], (), {})
+            felt = [(v, float(np.sum((f.residual - own.residual) ** 2))) for v, f, own in near]
+            size = float(np.sum(self.fitted(self.library.model, (), self.few, {}).residual ** 2))
+        whole = self.fitted(self.library.model, causes, self.few, start) if len(causes) > 1 else now
         # In the place of causes a setting must leave no more than they do.
         out = [[t for t in alone if exact or _near(t[2], whole)]]
-        for g in [tuple(c for c in causes if c is not gone) for gone in causes] if len(causes) > 1 else []:
-            gone = 0.0 if exact else float(np.sum(self.fitted(library, library.model, g, self.few, start).residual ** 2))
+        for g in [without(causes, (c,)) for c in causes] if len(causes) > 1 else []:
+            gone = 0.0 if exact else float(np.sum(self.fitted(self.library.model, g, self.few, start).residual ** 2))
             own = gone - float(np.sum(whole.residual**2))
             alike = [v for v, moved in felt if exact or LIKE * own < moved < own / LIKE]
-            out.append(self.ranked(library, alike, g, start, None if exact else whole))
+            out.append(self.rank(alike, g, start, None if exact else whole))
         if causes and now.chi.max() >= QUIET and not noise(now, SURE):
             some = [v for v, moved in felt if exact or moved > FALL * size or moved < STILL * size]
-            out.append(self.ranked(library, some, causes, start))
+            out.append(self.rank(some, causes, start))
         return out
 
-    def ranked(
-        self,
-        library: Library,
-        variants: Sequence[Variant],
-        causes: Causes,
-        start: dict[str, float] | None = None,
-        rival: Fit | None = None,
+    def rank(
+        self, variants: Sequence[Variant], causes: Causes, start: Numbers | None = None, rival: Fit | None = None
     ) -> list[Tried]:
         """The same causes under every setting on some of the windows, best first; without noise, or among the best, fitted.
 
-        One that leaves nearly all of the residual after a step is not fitted: it would have to explain most of it.
-
-        rival: what leaves much less than one of them is none of it.
+        One that leaves nearly all of the residual after a step is not fitted: it would have to explain most of it. rival: what
+        leaves much less than one of them is none of it.
         """
         self.tell("settings of the engine" + (f" beside {len(causes)} causes" if causes else ""))
         known = start or {}
-        if library.measured.exact:
-            return _best([t for v in variants if (t := self.under_one(library, v, causes, known))])
-        near = [t for t in self.near(library, variants, causes, known) if rival is None or _near(t[1], rival)]
+        if self.library.measured.exact:
+            return _best([t for v in variants if (t := self.fit_under(v, causes, known))])
+        near = [t for t in self.near(variants, causes, known) if rival is None or _near(t[1], rival)]
         tried = _best([(v, causes, f) for v, f, _ in near])
-        left = HOPELESS * float(self.fitted(library, library.model, causes, self.few, known).chi.sum())
+        left = HOPELESS * float(self.fitted(self.library.model, causes, self.few, known).chi.sum())
         for i, t in enumerate(tried[:CONTENDERS]):
             if t[2].chi.sum() < left:
-                tried[i] = self.under_one(library, t[0], causes, known) or t
+                tried[i] = self.fit_under(t[0], causes, known) or t
         return _best(tried)
 
-    def near(
-        self, library: Library, variants: Sequence[Variant], causes: Causes, start: dict[str, float]
-    ) -> list[tuple[Variant, Fit, Fit]]:
+    def near(self, variants: Sequence[Variant], causes: Causes, start: Numbers) -> list[tuple[Variant, Fit, Fit]]:
         """Under each setting, one step from the fit without it: fits of the causes; and what that fit is after such a step."""
-        key = id(library), tuple(c.key for c in causes), tuple(sorted(start.items()))
+        key = tuple(c.key for c in causes), tuple(sorted(start.items()))
         known = self._near.setdefault(key, [])
         new = [v for v in variants if not any(v is k for k, _ in known)]
-        found = self._stepped(library, new, causes, start) if new else []
+        found = self._step(new, causes, start) if new else []
         known += [(v, next((t for t in found if t[0] is v), None)) for v in new]
         return [t for v in variants for k, t in known if k is v and t is not None]
 
-    def _stepped(
-        self, library: Library, variants: Sequence[Variant], causes: Causes, start: dict[str, float]
-    ) -> list[tuple[Variant, Fit, Fit]]:
-        base = self.fitted(library, library.model, causes, self.few, start)
-        under = [(v, self.bare(library, v.model).hypothesis(causes)) for v in variants]
+    def _step(self, variants: Sequence[Variant], causes: Causes, start: Numbers) -> list[tuple[Variant, Fit, Fit]]:
+        base = self.fitted(self.library.model, causes, self.few, start)
+        under = [(v, self.bare(v.model).hypothesis(causes)) for v in variants]
         alike = [(v, h) for v, h in under if h.names == base.hypothesis.names]
         own, *fits = stepped(base, self.few, [base.hypothesis, *(h for _, h in alike)])
         found = [(v, f, own or base) for (v, _), f in zip(alike, fits, strict=True) if f is not None]
         # A setting that takes numbers away, or brings some, has no slopes in common.
-        others = [self.under_one(library, v, causes, start) for v, h in under if h.names != base.hypothesis.names]
+        others = [self.fit_under(v, causes, start) for v, h in under if h.names != base.hypothesis.names]
         return [*found, *((t[0], t[2], base) for t in others if t is not None)]
 
-    def under_one(self, library: Library, v: Variant, causes: Causes, start: dict[str, float]) -> Tried | None:
+    def fit_under(self, v: Variant, causes: Causes, start: Numbers) -> Tried | None:
         """The causes fitted under a setting; None where no robot stands: a link without inertia is flung about."""
         with contextlib.suppress(UsageError):
-            return v, causes, self.fitted(library, v.model, causes, self.few, start)
+            return v, causes, self.fitted(v.model, causes, self.few, start)
         return None
 
-    def bare(self, library: Library, model: Model) -> Library:
+    def bare(self, model: Model) -> Library:
         """For sets of causes under another model: it has candidates of its own only where it is searched."""
-        key = id(model), id(library.measured)
-        if key not in self._bare:
-            self._bare[key] = Library(model, library.measured, [])
-        return self._bare[key]
+        return once(self._bare, id(model), lambda: Library(model, self.library.measured, []))
 
-    def fitted(self, library: Library, model: Model, causes: Causes, windows: Windows, start: dict[str, float]) -> Fit:
+    def fitted(self, model: Model, causes: Causes, windows: Windows, start: Numbers) -> Fit:
         key = id(model), id(windows), tuple(c.key for c in causes), tuple(sorted(start.items()))
-        if key not in self._fits:
-            self._fits[key] = self._fitted(library, model, causes, windows, start)
-        return self._fits[key]
-
-    def _fitted(self, library: Library, model: Model, causes: Causes, windows: Windows, start: dict[str, float]) -> Fit:
-        h = self.bare(library, model).hypothesis(causes)
-        known = {n: start.get(n, v) for n, v in zip(h.names, h.value.tolist(), strict=True)}
-        return fit(h, windows, theta=np.array([known[n] for n in h.names]), iterations=SECOND)
-
-    def charge(self, library: Library, count: int) -> float:
-        return 12 + 2 * math.log(len(library.candidates) + count)
+        h = self.bare(model).hypothesis(causes)
+        return once(self._fits, key, lambda: fit(h, windows, theta=numbers(h, start), iterations=SECOND))
 
     def pays(self, new: Fit, old: Fit, charge: float, *, fewer: bool) -> bool:
         """In place of causes only the choice is charged; beside them it pays for itself, on the later windows as well."""
-        return setting_pays(new, old, charge, fewer=fewer) and (fewer or confirmed(new, old, self.later))
+        return setting_pays(new, old, charge, fewer=fewer) and (fewer or confirms(new, old, self.later))
 
-    def better(
-        self, library: Library, found: Found, groups: Sequence[Sequence[Tried]], number: int
-    ) -> tuple[Search, Found, Setting] | None:
-        """Another setting, and what is found under it; None where none pays."""
-        count, now = len(found[0]), found[1]
-        charge = self.charge(library, number)
-        best: tuple[Search, Found, Setting] | None = None
-        for tried in groups:
-            for variant, causes, first in tried[:FINALISTS]:
-                whole = self.fitted(library, variant.model, causes, self.earlier, values(first))
-                if not self.pays(whole, now, charge, fewer=len(causes) < count):
+    def better(self, settled: Settled, alone: Sequence[Tried], number: int) -> Settled | None:
+        """What is found under another setting that pays, one of so many; None where none does."""
+        (causes, now), charge = settled.found, self.library.charge(number)
+        best: Settled | None = None
+        for tried in self.groups(alone, settled.found):
+            for variant, some, first in tried[:FINALISTS]:
+                whole = self.fitted(variant.model, some, self.earlier, values(first))
+                if not self.pays(whole, now, charge, fewer=len(some) < len(causes)):
                     continue
-                search, again = self.under(library, variant.model)
-                pays = self.pays(again[1], now, charge, fewer=len(again[0]) < count)
-                if pays and (best is None or better(again[1], best[1][1]) > 0):
-                    best = search, again, _setting(library, tried, variant)
+                search, again = self.under(variant)
+                pays = self.pays(again[1], now, charge, fewer=len(again[0]) < len(causes))
+                if pays and (best is None or better(again[1], best.found[1]) > 0):
+                    best = Settled(search, again, (*settled.settings, _setting(self.library, tried, variant)))
         return best
 
 
@@ -263,16 +232,14 @@ def _best(tried: list[Tried]) -> list[Tried]:
     return sorted(tried, key=lambda t: float(np.sum(np.log(np.maximum(t[2].chi, TINY)))))
 
 
-def _simpler(search: Search, found: Found) -> list[Found]:
+def _simpler(sets: FittedSets, found: Found) -> list[Found]:
     """A law by each of those that it contains."""
-    (c, *_), contains = found[0], search.library.contains
-    simple = [e for e in search.library.candidates if e.site == c.site and contains(c.effect.name, e.effect.name)]
-    return [((e,), search.fit((e,), None, search.carried(c, e, found))) for e in simple]
+    simple = [e for e in sets.library.candidates if sets.library.within(e, found[0][0])]
+    return [((e,), sets.fit((e,), None, sets.carry(found[0][0], e, found))) for e in simple]
 
 
-def _setting(library: Library, tried: Sequence[Tried], chosen: Variant | None = None) -> Setting:
-    """The chosen one, by default the first, against the best of another name."""
-    chosen = chosen or tried[0][0]
+def _setting(library: Library, tried: Sequence[Tried], chosen: Variant) -> Setting:
+    """The chosen one, against the best of another name."""
     own = next(f for v, _, f in tried if v is chosen)
     rival = next(((v, f) for v, _, f in tried if v.setting != chosen.setting), None)
     return Setting(chosen, library, rival[0] if rival else None, better(own, rival[1]) if rival else math.inf)

@@ -17,7 +17,7 @@ from gapcert_diagnosis.fitting.fit import Fit
 from gapcert_diagnosis.fitting.linearised import LinearisedMotion, Motion, shortened
 
 from .candidates import Candidate, Causes, Library
-from .matching_pursuit import ALIKE, Entered, Pile, Rows
+from .matching_pursuit import ALIKE, Columns, MatchingPursuit, Rows
 
 STEEP = 1e9  # noise floors
 BLOCK = 0.008  # s
@@ -29,7 +29,7 @@ NEAR = (0.6, 1.6)  # the gain of a law that is not linear in any of its numbers 
 
 @final
 @dataclass(frozen=True)
-class Screened:
+class Promise:
     """A move, first values of its numbers by name, and the fall of the squared residual, in units of χ, that they promise."""
 
     move: Causes
@@ -68,7 +68,7 @@ class Column:
 
 
 @final
-class Ledger:
+class GainTable:
     """Gains of columns for one fit: normal equations after the starts of the windows and the free numbers are projected out.
 
     Samples are averaged over blocks, which costs nothing that the eye of a screen would miss.
@@ -95,8 +95,7 @@ class Ledger:
         self.inverse = self._inverse(self.precision, self.pinned)
         self.columns: dict[tuple[str, str], Column] = {}
         self.entered: set[tuple[str, str]] = set()
-        self._by_key: dict[tuple[str, str], Candidate] = {}
-        self._empty: Pile | None = None
+        self._empty: MatchingPursuit | None = None
 
     def _inverse(self, precision: Array, pinned: npt.NDArray[np.bool_]) -> Array:
         """Of the normal equations with a prior, without the numbers that are pinned."""
@@ -114,7 +113,6 @@ class Ledger:
             self._split(some, self._rows(np.concatenate([p.state for p in some if p.state is not None], axis=-1), None))
         self.entered |= {p.candidate.key for p in pushes}
         for p in pushes:
-            self._by_key |= {p.candidate.key: p.candidate} if p.state is not None or p.output is not None else {}
             if p.output is not None:
                 self._split([p], self._rows(None, p.output))
 
@@ -135,13 +133,13 @@ class Ledger:
             old = self.columns.get(p.candidate.key)
             self.columns[p.candidate.key] = new if old is None else old.beside(new)
 
-    def promise(self, move: Causes) -> Screened | None:
+    def promise(self, move: Causes) -> Promise | None:
         """The best first values of a move, None where it promises nothing."""
         if self.library.loosened(move[0]) is not None:
             return self._freed(move[0]) if len(move) == 1 else None
         return self._started(move, [int(np.argmax(self.columns[c.key].gain)) for c in move])
 
-    def _started(self, move: Causes, best: Sequence[int]) -> Screened:
+    def _started(self, move: Causes, best: Sequence[int]) -> Promise:
         """A move whose members begin at these of their starts."""
         column = self.columns[move[0].key]
         gain, multiples = float(column.gain[best[0]]), column.multiple[best[:1]]
@@ -154,71 +152,68 @@ class Ledger:
                 off = self.library.off(c)[k]
                 start[k] = off + a * (start[k] - off)
             found |= dict(zip(self.library.names(c), start.tolist(), strict=True))
-        return Screened(move, found, max(gain, 0.0))
+        return Promise(move, found, max(gain, 0.0))
 
-    def pursued(self, most: int) -> tuple[list[Screened], list[float]]:
-        """(sets, gains) of 1, 2, … candidates, each next one the one that promises most beside those before it.
-
-        The gains are those of the whole sets.
-        """
-        pile, sets = self._pile(), list[Screened]()
-        e = pile.entered
-        while len(sets) < most and (i := pile.best()) is not None:
-            pile.take(i)
-            sets.append(self._started(tuple(e.known[o] for o in e.owner[pile.picks]), e.inner[pile.picks].tolist()))
-        return sets, [s.gain for s in sets]
+    def pursue(self, most: int) -> list[Promise]:
+        """Sets of 1, 2, … candidates, each next one the one that promises most beside those before it."""
+        pursuit, sets = self._pursuit(), list[Promise]()
+        e = pursuit.columns
+        while len(sets) < most and (i := pursuit.best()) is not None:
+            pursuit.take(i)
+            sets.append(self._started(tuple(e.known[o] for o in e.owner[pursuit.picks]), e.inner[pursuit.picks].tolist()))
+        return sets
 
     def beside(self, causes: Causes) -> dict[tuple[str, str], float]:
         """Per candidate what it promises beside these, each at the start that promises most beside those before it."""
-        pile = self._pile()
-        entered = pile.entered
+        pursuit = self._pursuit()
+        columns = pursuit.columns
         for c in causes:
-            gains = np.where(entered.of(c), pile.gains(), 0.0)
+            gains = np.where(columns.of(c), pursuit.gains(), 0.0)
             if gains.max(initial=0.0) > 0:
-                pile.take(int(np.argmax(gains)))
-        gains, out = pile.gains(), dict[tuple[str, str], float]()
-        for o, gain in zip(entered.owner.tolist(), gains.tolist(), strict=True):
-            key = entered.known[o].key
+                pursuit.take(int(np.argmax(gains)))
+        gains, out = pursuit.gains(), dict[tuple[str, str], float]()
+        for o, gain in zip(columns.owner.tolist(), gains.tolist(), strict=True):
+            key = columns.known[o].key
             out[key] = max(out.get(key, 0.0), gain)
         return out
 
-    def _pile(self) -> Pile:
+    def _pursuit(self) -> MatchingPursuit:
         """Of all that has been entered, nothing taken yet."""
         count = sum(len(c.gain) for c in self.columns.values())
         if self._empty is None or len(self._empty.open) != count:
-            self._empty = Pile(self.library, self._entered(), self.slopes, self.inverse, self.along, self.residual)
+            self._empty = MatchingPursuit(self.library, self._all(), self.slopes, self.inverse, self.along, self.residual)
         return copy.copy(self._empty)
 
-    def _entered(self) -> Entered:
-        known = [c for _, c in sorted(self._by_key.items()) if len(self.columns[c.key].gain)]
+    def _all(self) -> Columns:
+        entered = [c for c in self.library.candidates if c.key in self.columns and len(self.columns[c.key].gain)]
+        known = sorted(entered, key=lambda c: c.key)
         columns = [self.columns[c.key] for c in known]
         counts = [len(c.gain) for c in columns]
         owner, inner = np.repeat(np.arange(len(known)), counts), np.array([i for n in counts for i in range(n)], dtype=np.intp)
         empty = np.empty((self.residual.size, 0)), np.empty((0, 0))
         rows, seen = (np.concatenate([getattr(c, n) for c in columns], axis=1) for n in ("rows", "seen")) if known else empty
         limits = np.array([self._bounds(known[o], columns[o].values[i]) for o, i in zip(owner, inner, strict=True)])
-        return Entered(known, owner, inner, rows, seen, limits.reshape(-1, 2))
+        return Columns(known, owner, inner, rows, seen, limits.reshape(-1, 2))
 
-    def pairs(self, most: int) -> list[Screened]:
+    def pairs(self, most: int) -> list[Promise]:
         """Two candidates at once, the most promising first; of pairs whose columns point the same way, the best.
 
         Greedy steps miss two laws neither of which helps much without the other.
         """
-        e = self._entered()
+        e = self._all()
         known, owner, inner, rows, seen, limits = e.known, e.owner, e.inner, e.rows, e.seen, e.limits
         if len(known) < 2:
             return []
         gains = np.concatenate([self.columns[c.key].gain for c in known])
         keep = np.sort(np.argsort(-gains, kind="stable")[:COLUMNS])
         owner, inner, rows, seen, limits = owner[keep], inner[keep], rows[:, keep], seen[:, keep], limits[keep]
-        cross = rows.T @ self.slopes
-        curve = rows.T @ rows - seen.T @ seen - cross @ self.inverse @ cross.T
-        slope = cross @ self.inverse @ self.along - (rows.T @ self.residual)[:, 0]
+        curve, slope = self._normal_equations(rows, seen)
         gain = _both(curve, slope, limits[:, 0], limits[:, 1])
-        gain[self._clash(known)[np.ix_(owner, owner)]] = 0.0
+        clash = np.array([[self.library.related(a, b) for b in known] for a in known])
+        gain[clash[np.ix_(owner, owner)]] = 0.0
         size = np.sqrt(np.maximum(np.diag(curve), 1e-300))
         alike = np.abs(curve / np.outer(size, size)) > ALIKE
-        found: list[Screened] = []
+        found: list[Promise] = []
         gain = np.triu(gain)
         while len(found) < most and gain.max(initial=0.0) > 0:
             i, j = (int(k) for k in np.unravel_index(int(np.argmax(gain)), gain.shape))
@@ -226,9 +221,11 @@ class Ledger:
             gain[np.outer(alike[i], alike[j]) | np.outer(alike[j], alike[i])] = 0.0
         return found
 
-    def _clash(self, known: Sequence[Candidate]) -> npt.NDArray[np.bool_]:
-        """Pairs (C, C) of which one is the other, or contains it at the same site."""
-        return np.array([[a is b or (a.site == b.site and self.library.related(a, b)) for b in known] for a in known])
+    def _normal_equations(self, rows: Array, seen: Array) -> tuple[Array, Array]:
+        """Curvatures (K, K) and slopes (K,) of columns, without what starts and free numbers make of them."""
+        cross = rows.T @ self.slopes
+        curve = rows.T @ rows - seen.T @ seen - cross @ self.inverse @ cross.T
+        return curve, cross @ self.inverse @ self.along - (rows.T @ self.residual)[:, 0]
 
     def best(self, c: Candidate) -> Array:
         """The start of a candidate that promises most."""
@@ -247,8 +244,7 @@ class Ledger:
             off, enough = self.library.off(c)[0], np.flatnonzero(curve > scale)
             if not len(enough):
                 return None
-            nearest: Array = values[enough[np.argmin(np.abs(values[enough, 0] - off))]]
-            return nearest
+            return np.asarray(values[enough[np.argmin(np.abs(values[enough, 0] - off))]])
         i, off = int(np.argmax(curve)), self.library.off(c)[k]
         least: Array = values[i].copy()
         least[k] = off + (least[k] - off) * scale / curve[i]
@@ -278,9 +274,7 @@ class Ledger:
         columns = [(self.columns[c.key], i) for c, i in zip(move, best, strict=True)]
         low, high = np.array([self._bounds(k, c.values[i]) for k, (c, i) in zip(move, columns, strict=True)]).T
         rows, seen = (np.stack([getattr(c, n)[:, i] for c, i in columns], axis=-1) for n in ("rows", "seen"))
-        cross = rows.T @ self.slopes
-        curve = rows.T @ rows - seen.T @ seen - cross @ self.inverse @ cross.T
-        slope = cross @ self.inverse @ self.along - (rows.T @ self.residual)[:, 0]
+        curve, slope = self._normal_equations(rows, seen)
         a, free = np.zeros(len(low)), np.diag(curve) > 1e-9
         for _ in range(len(a)):
             rest = slope - curve[:, ~free] @ a[~free]
@@ -292,7 +286,7 @@ class Ledger:
             free = free & ~out
         return float(2 * a @ slope - a @ curve @ a), a
 
-    def _freed(self, c: Candidate) -> Screened | None:
+    def _freed(self, c: Candidate) -> Promise | None:
         """What the fit gains where a number is no longer held by its prior."""
         (name,) = self.library.names(c)
         if name not in self.fit.hypothesis.names:
@@ -304,7 +298,7 @@ class Ledger:
         gain = self.precision[k] * self.off[k] ** 2 + along @ move - self.along @ self.inverse @ self.along
         # A straight line says little about a value that is far off; a fit from half or twice the stated one finds it.
         low, high = np.sort(self.fit.hypothesis.value[k] * np.array(FREED))
-        return Screened((c,), {name: float(np.clip(self.fit.theta[k] - move[k], low, high))}, max(float(gain), 0.0))
+        return Promise((c,), {name: float(np.clip(self.fit.theta[k] - move[k], low, high))}, max(float(gain), 0.0))
 
     def _rows(self, state: Array | None, output: Array | None) -> Array:
         """What pushes (W, S, nx, K) and differences of the output (W, L, ny, K) do to the residual, (W', blocks·ny, K)."""

@@ -1,4 +1,4 @@
-"""Columns of a ledger that are taken one after another, and what each that is left promises beside those."""
+"""Columns of a table of gains that are taken one after another, and what each that is left promises beside those."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ EVEN = 0.95  # of a law's promise, from which one that it contains is taken inst
 
 @final
 @dataclass(frozen=True)
-class Entered:
+class Columns:
     """Candidates that push; of every column whose it is, which of its starts, its rows (N, K), what starts see, its bounds."""
 
     known: Sequence[Candidate]
@@ -37,17 +37,17 @@ class Entered:
 
 
 @final
-class Pile:
+class MatchingPursuit:
     """Orthogonal matching pursuit.
 
     With curvature c, slope s and i the column that is taken, c − cᵢᵢ⁻¹ cᵢcᵢᵀ and s − cᵢᵢ⁻¹ sᵢcᵢ are left.
     """
 
     def __init__(
-        self, library: Library, entered: Entered, slopes: Array, inverse: Array, along: Array, residual: Array
+        self, library: Library, columns: Columns, slopes: Array, inverse: Array, along: Array, residual: Array
     ) -> None:
-        """slopes (N, p), with the inverse of their normal equations, and the residual (N, 1) of a ledger."""
-        self.library, self.entered, rows, seen = library, entered, entered.rows, entered.seen
+        """slopes (N, p), with the inverse of their normal equations, and the residual (N, 1) of a table."""
+        self.library, self.columns, rows, seen = library, columns, columns.rows, columns.seen
         self.cross = rows.T @ slopes
         self.pulled = self.cross @ inverse
         self.slope = self.pulled @ along - (rows.T @ residual)[:, 0]
@@ -60,14 +60,14 @@ class Pile:
 
     def gains(self) -> Array:
         """What each column (K,) promises beside those that are taken: nothing, if it is alike or at odds with one of them."""
-        usable, limits = self.open & (self.curve > self.least), self.entered.limits
+        usable, limits = self.open & (self.curve > self.least), self.columns.limits
         a = np.divide(self.slope, self.curve, out=np.zeros_like(self.slope), where=usable)
         a = np.clip(a, limits[:, 0], limits[:, 1])
         return np.where(usable, 2 * a * self.slope - a**2 * self.curve, 0.0)
 
     def best(self) -> int | None:
         """The column that promises most; of laws that contain one another the simplest that promises nearly as much."""
-        gains, known, owner = self.gains(), self.entered.known, self.entered.owner
+        gains, known, owner = self.gains(), self.columns.known, self.columns.owner
         if gains.max(initial=0.0) <= 0:
             return None
         i = int(np.argmax(gains))
@@ -76,12 +76,12 @@ class Pile:
         return min([i, *kin], key=lambda k: (self.library.simplicity((known[int(owner[k])],))[0], -gains[k]))
 
     def take(self, i: int) -> None:
-        e = self.entered
+        e = self.columns
         own = e.rows.T @ e.rows[:, i] - e.seen.T @ e.seen[:, i] - self.pulled @ self.cross[i]
         column = (own - sum((g * g[i] for g in self._gone), np.zeros_like(own))) / math.sqrt(self.curve[i])
         self.slope, self.curve = self.slope - column * (self.slope[i] / column[i]), self.curve - column**2
         self.picks, self._gone = [*self.picks, i], [*self._gone, column]
         c = e.known[int(e.owner[i])]
         # Not twice the same law at one site.
-        at_odds = np.array([k is c or (k.site == c.site and self.library.related(k, c)) for k in e.known])
+        at_odds = np.array([self.library.related(k, c) for k in e.known])
         self.open = self.open & ~at_odds[e.owner]

@@ -1,62 +1,191 @@
-"""Sets that differ from a found one by a law in the place of another: of one that it contains, of its family, or of two."""
+"""What a set of causes may become next: with a move more, or with something else in the place of one or two of its causes."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import itertools
+import math
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from gapcert_diagnosis.fitting.fit import promising
+from gapcert_diagnosis.fitting.fit import Fit, promising
 
-from .candidates import Candidate, Causes
-from .criterion import TIE, Found, keys, noise, values
+from .candidates import Candidate, Causes, Library
+from .criterion import TIE, Found, Keys, keys, noise, numbers, rank, scores, values, without
+from .fitted_sets import FIRST, FittedSets
+from .gains import Promise
 
-if TYPE_CHECKING:
-    from .stepwise import Search
-
+BRIEFLY = 2  # iterations of a short fit that shows whether it is worth the others
+HOPE = 8.0  # promised fall of the squared residual below which nothing is tried
+BY_SHORT, BY_LONG = 8, 4  # candidates that get a short fit
+KEEP, MORE = 4, 2  # candidates that get a full fit; near ties beside them
+CLOSE = 2.0  # times the least squared residual, within which a full fit of dry laws is made again
+BEHIND = 100.0  # score on short windows by which a rival may be worse, and still be as good on long ones
+LOST = 10 * BEHIND  # the same, from which a rival is not fitted to long ones, unless it is the best
+FADED = 0.7  # of the promise of a rival that is far behind: what promises less is not tried
+SLOW = 0.5  # of the best promise, what a law that remembers must promise to be tried in the place of another family's
+LIKELY = 0.3  # of what a cause promises, what a rival of it must promise
 ASTRAY = 1.1  # times the squared residual, from which the first values of a law lead nowhere
 LESS = 8.0  # fall of the squared residual that is not worth a richer law
 
+Tried = tuple[Promise, Fit]
 Option = tuple[Causes, dict[str, float]]
 
 
-def idle(search: Search, found: Found, new: Causes) -> bool:
+def additions(sets: FittedSets, base: Found, instead: Candidate | None = None, hope: float = HOPE) -> list[Found]:
+    """Fits of a set with one move more, best first; none where screening promises nothing.
+
+    instead: of this cause; where nothing comes near it, the best on short windows.
+    """
+    causes, library = base[0], sets.library
+
+    def allowed(move: Causes) -> bool:
+        """Not twice the same law at one site: a law that contains another takes its place, not a place beside it."""
+        c, *more = move
+        if instead and (more or c.key == instead.key or library.contains(c.effect.name, instead.effect.name)):
+            return False
+        return not any(library.related(c, k) for c in move for k in causes)
+
+    if keys(causes) in sets.added:
+        return rank([f for f in sets.added[keys(causes)] if allowed(without(f[0], causes))], sets.cautious)
+    short, long = (worth([s for s in p if allowed(s.move)], p, instead) for p in sets.promises(base, instead))
+    least = hope + 2 * math.log(max(1, len(library.candidates)))
+    if max((p[0].gain for p in (short, long) if p), default=-math.inf) < least:
+        return []
+    few = {keys(s.move): s for s in plain([*long[:BY_LONG], *short[:BY_SHORT]], library)}
+    blind = [s for s in stuck(sets, causes, few) if allowed(s.move)]
+    picks, known = [*few.values(), *blind], None if instead is None else sets.known((*causes, instead))
+    if instead is None or known is None:
+        tried = [(s, sets.try_move(base, s)) for s in picks]
+    else:
+        own = sets.brief(((*causes, instead), known))
+        tried = near(replacements(sets, picks, base, instead, own), own, sets.cautious)
+        if all(keys((*causes, *s.move)) in sets.lost for s, _ in tried):
+            return [((*causes, *s.move), f) for s, f in tried]
+    if not tried:
+        return []
+    best = finalists(tried, [keys(s.move) for s in long[:MORE]], sets.cautious)
+    grown = [((*causes, *s.move), values(sets.fit_further(first))) for s, first in best]
+    full = rank([(new, sets.fit(new, base, start)) for new, start in grown], sets.cautious)
+    least = (full[0][1] if known is None else known).chi.sum()
+    close = [s for s, f in full if f.chi.sum() < CLOSE * least]
+    full = rank([(s, sets.fit_shaken(s, (s, f)) if s in close else f) for s, f in full], sets.cautious)
+    if instead is None:
+        sets.added[keys(causes)] = full
+    return full
+
+
+def finalists(tried: list[Tried], also: Collection[object], cautious: bool) -> list[Tried]:
+    """The best of each family, so that one does not crowd out the others; and what is in `also`."""
+    families: dict[object, tuple[float, Tried]] = {}
+    for score, t in sorted(zip(scores([f for _, f in tried], cautious), tried, strict=True), key=lambda p: p[0]):
+        families.setdefault(frozenset((c.effect.family or c.effect.name, c.site) for c in t[0].move), (score, t))
+    least, kept = min(score for score, _ in families.values()), list[Tried]()
+    for k, (score, t) in enumerate(families.values()):
+        close = k < KEEP + MORE and score < least + TIE
+        if k < KEEP or close or keys(t[0].move) in also:
+            kept.append(t)
+    return kept
+
+
+def near(tried: list[Tried], own: Fit, cautious: bool) -> list[Tried]:
+    """The best, and those that are not far behind the fit of what they would stand for."""
+    mine, *others = scores([own, *(f for _, f in tried)], cautious)
+    least = max(min(others, default=0.0), mine + BEHIND)
+    return [t for t, score in zip(tried, others, strict=True) if score <= least]
+
+
+def replacements(sets: FittedSets, picks: list[Promise], base: Found, instead: Candidate, own: Fit) -> list[Tried]:
+    """Short fits in the place of a cause, whose own is given; none of what promises plainly less than one far behind that.
+
+    What remembers takes many times as long as what does not: of another family it is not tried either where a law within it is
+    far behind, or where others promise much more.
+    """
+    tried, far, library = list[Tried](), list[Promise](), sets.library
+    most = max((s.gain for s in picks), default=0.0)
+    for s in sorted(picks, key=lambda s: library.simplicity(s.move)[0]):
+        new, grown = s.move[0], keys((*base[0], *s.move))
+        if 0 < s.gain < FADED * max((t.gain for t in far), default=0.0):
+            sets.lost.add(grown)
+            continue
+        slow = new.effect.family != instead.effect.family and bool(library.extension(new).memory)
+        if slow and (s.gain < SLOW * most or any(library.within(t.move[0], new) for t in far)):
+            continue
+        first = sets.try_move(base, s, BRIEFLY)
+        behind = sets.better(own, first)
+        if behind <= LOST:
+            first = sets.fit_further(first, FIRST - BRIEFLY)
+            behind = sets.better(own, first)
+        tried.append((s, first))
+        far += [s] if behind > BEHIND else []
+        sets.lost |= {grown} if behind > LOST else set()
+    return tried
+
+
+def worth(some: list[Promise], promised: Sequence[Promise], instead: Candidate | None) -> list[Promise]:
+    """Of some moves in the place of a cause the best, and those that promise much of what it does; without one, all."""
+    if instead is None:
+        return some
+    own = next((s.gain for s in promised if keys(s.move) == {instead.key}), 0.0)
+    least = min(LIKELY * own, max((s.gain for s in some), default=0.0))
+    return [s for s in some if s.gain >= least]
+
+
+def plain(picks: list[Promise], library: Library) -> list[Promise]:
+    """Without a law at many sites beside one that it contains: where that one leads, it is swapped in site by site."""
+    many = [s.move[0].effect.name for s in picks if len(s.move) > 1]
+    return [s for s in picks if len(s.move) == 1 or not any(library.contains(s.move[0].effect.name, n) for n in many)]
+
+
+def stuck(sets: FittedSets, causes: Causes, but: Collection[Keys]) -> list[Promise]:
+    """Dry friction at every coordinate but those tried already: one that sticks shows a screen neither speed nor force."""
+    if causes:
+        return []
+    library, brief, out = sets.library, sets.brief(((), sets.nothing)), []
+    dry = [c for c in library.candidates if len(library.dry((c,))) == 1 == len(c.effect.parameters)]
+    for c in (c for c in dry if keys((c,)) not in but):
+        h, names, starts = library.hypothesis((c,)), library.names(c), library.starts(c)
+        thetas = [numbers(h, values(brief) | dict(zip(names, row, strict=True))) for row in starts.tolist()]
+        theta = promising(h, sets.short, np.array(thetas), brief.start)[0]
+        out.append(Promise((c,), {n: float(theta[h.names.index(n)]) for n in names}, 0.0))
+    return out
+
+
+def idle(sets: FittedSets, found: Found, new: Causes) -> bool:
     """Is there a law between one and its richer substitute, and none of these leaves less?
 
     Or is noise left, and the substitute remembers, which takes long to fit, and leaves plainly more wherever it would begin?
     """
     causes, now = found
-    gone, come = ([c for c in one if c.key not in keys(other)] for one, other in ((causes, new), (new, causes)))
+    gone, come = without(causes, new), without(new, causes)
     if not len(gone) == len(come) == 1:
         return False
-    if noise(now) and search.library.extension(come[0]).memory and _astray(search, found, gone[0], come[0], new):
+    if noise(now) and sets.library.extension(come[0]).memory and _astray(sets, found, gone[0], come[0], new):
         return True
-    between = [k for k in search.library.candidates if search.library.within(gone[0], k) and search.library.within(k, come[0])]
-    fits = [search.known(tuple(k if j is gone[0] else j for j in causes)) for k in between]
+    between = [k for k in sets.library.candidates if sets.library.within(gone[0], k) and sets.library.within(k, come[0])]
+    fits = [sets.known(tuple(k if j is gone[0] else j for j in causes)) for k in between]
     least = float(np.sum(now.residual**2)) - LESS
     return bool(fits) and all(f is not None and float(np.sum(f.residual**2)) > least for f in fits)
 
 
-def _astray(search: Search, found: Found, old: Candidate, come: Candidate, new: Causes) -> bool:
+def _astray(sets: FittedSets, found: Found, old: Candidate, come: Candidate, new: Causes) -> bool:
     """Do all first values of a law leave plainly more than what it would take the place of?"""
-    h, names, starts = search.library.hypothesis(new), search.library.names(come), search.library.starts(come)
-    known = dict(zip(h.names, h.value.tolist(), strict=True)) | values(found[1])
-    same = search.carried(old, come, found, default=False)
-    rows = [known | dict(zip(names, row, strict=True)) | same for row in starts.tolist()]
-    thetas = np.array([[row[n] for n in h.names] for row in rows])
-    return promising(h, search.windows, thetas, found[1].start)[2] > ASTRAY * float(np.sum(found[1].residual ** 2))
+    h, names, starts = sets.library.hypothesis(new), sets.library.names(come), sets.library.starts(come)
+    known, same = values(found[1]), sets.carry(old, come, found, default=False)
+    thetas = [numbers(h, known | dict(zip(names, row, strict=True)) | same) for row in starts.tolist()]
+    return promising(h, sets.windows, np.array(thetas), found[1].start)[2] > ASTRAY * float(np.sum(found[1].residual ** 2))
 
 
-def swaps(search: Search, found: Found) -> list[Option]:
+def swaps(sets: FittedSets, found: Found) -> list[Option]:
     """Each cause replaced by a law that it contains; by one that contains it, or of its family, where that may pay.
 
     Where a joint sticks, or remembers, no screen shows what a richer law would change. Where samples cannot be counted, a law
     is also replaced at all its sites at once: windows that agree on all of them may hesitate about each.
     """
-    library, (causes, now) = search.library, found
+    library, (causes, now) = sets.library, found
     n = now.residual.shape[0] * now.residual.shape[1]
     left = float(np.sum(now.whiteness * n * np.log(np.maximum(now.chi, 1.0)))) > 2 * TIE
-    out: dict[frozenset[tuple[str, str]], Option] = {}
+    out: dict[Keys, Option] = {}
     for c in causes:
         for e in library.candidates:
             if e.site != c.site or e.key in keys(causes) or any(library.related(e, k) for k in causes if k is not c):
@@ -64,47 +193,44 @@ def swaps(search: Search, found: Found) -> list[Option]:
             certain = library.contains(c.effect.name, e.effect.name) or library.richer(e, c)
             family = bool(c.effect.family) and c.effect.family == e.effect.family
             kin = family or library.contains(e.effect.name, c.effect.name)
-            if certain or (kin and (left or ((s := search.promise(found, e)) is not None and s.gain > TIE))):
-                places: list[Causes] = [(c,)]
-                if certain and len(alike := _alike(search, causes, c)) > 1:
-                    places.append(alike)
-                for where in places:
-                    new, start = _swapped(search, found, where, e)
+            if certain or (kin and (left or ((s := sets.promise(found, e)) is not None and s.gain > TIE))):
+                alike = _alike(sets, causes, c)
+                for where in ((c,), alike) if certain and len(alike) > 1 else ((c,),):
+                    new, start = _swapped(sets, found, where, e)
                     out.setdefault(keys(new), (new, start))
     return list(out.values())
 
 
-def spared(search: Search, causes: Causes, new: Causes) -> bool:
+def spared(sets: FittedSets, causes: Causes, new: Causes) -> bool:
     """Does a simpler law take one of several sites from a law that is judged at all of them at once?"""
-    gone, come = ([c for c in one if c.key not in keys(other)] for one, other in ((causes, new), (new, causes)))
-    if not len(gone) == len(come) == 1 or len(_alike(search, causes, gone[0])) == 1:
+    gone, come = without(causes, new), without(new, causes)
+    if not len(gone) == len(come) == 1 or len(_alike(sets, causes, gone[0])) == 1:
         return False
-    return search.library.contains(gone[0].effect.name, come[0].effect.name)
+    return sets.library.contains(gone[0].effect.name, come[0].effect.name)
 
 
-def _alike(search: Search, causes: Causes, c: Candidate) -> Causes:
+def _alike(sets: FittedSets, causes: Causes, c: Candidate) -> Causes:
     """Causes that are judged with c: where samples cannot be counted, the same law at other sites."""
-    return tuple(k for k in causes if k is c or (search.cautious and k.effect.name == c.effect.name))
+    return tuple(k for k in causes if k is c or (sets.cautious and k.effect.name == c.effect.name))
 
 
-def _swapped(search: Search, found: Found, where: Causes, e: Candidate) -> Option:
+def _swapped(sets: FittedSets, found: Found, where: Causes, e: Candidate) -> Option:
     """With the law of e in the place of these causes, where it can act there."""
     rest = [k for k in found[0] if k not in where]
-    at = {k.site: k for k in search.library.candidates if k.effect.name == e.effect.name}
-    at = {site: new for site, new in at.items() if not any(search.library.related(new, k) for k in rest)}
+    at = {k.site: k for k in sets.library.candidates if k.effect.name == e.effect.name}
+    at = {site: new for site, new in at.items() if not any(sets.library.related(new, k) for k in rest)}
     start: dict[str, float] = {}
     for k in where:
-        start |= search.carried(k, at[k.site], found) if k.site in at else {}
+        start |= sets.carry(k, at[k.site], found) if k.site in at else {}
     return tuple(at.get(k.site, k) if k in where else k for k in found[0]), start
 
 
-def merges(search: Search, found: Found) -> list[Option]:
+def merges(sets: FittedSets, found: Found) -> list[Option]:
     """Two causes at one site as one law that contains the first of them."""
     causes, out = found[0], []
-    for a in causes:
-        for b in causes:
-            for e in search.library.candidates if a is not b and a.site == b.site else ():
-                rest = tuple(k for k in causes if k is not a and k is not b)
-                if e.site == a.site and a.effect.name in e.effect.contains and e.key not in keys(causes):
-                    out.append(((*rest, e), search.carried(a, e, found) | search.carried(b, e, found, default=False)))
+    for a, b in itertools.permutations(causes, 2):
+        for e in sets.library.candidates if a.site == b.site else ():
+            if e.site == a.site and a.effect.name in e.effect.contains and e.key not in keys(causes):
+                start = sets.carry(a, e, found) | sets.carry(b, e, found, default=False)
+                out.append(((*without(causes, (a, b)), e), start))
     return out

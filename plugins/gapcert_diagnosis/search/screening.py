@@ -7,8 +7,9 @@ and the numbers that are free already can make of the residual is projected out,
 
 from __future__ import annotations
 
+import functools
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, final
 
@@ -19,13 +20,14 @@ from gapcert_diagnosis.data.dataset import Windows
 from gapcert_diagnosis.fitting.fit import Fit
 from gapcert_diagnosis.fitting.linearised import Motion, Path
 
-from .candidates import Candidate, Causes, Library
-from .gains import BLOCK, Ledger, Push, Screened
+from .candidates import Candidate, Causes, Library, once
+from .gains import BLOCK, GainTable, Promise, Push
 
 SAMPLES = 5_000  # at most: more windows than that say nothing new about which candidates to try
 FINER, MANY = 7, 4  # points of a local scan, and starts of one number from which a scan between them pays
 ROWS = 512  # motions that are stepped together: more no longer stay near the processor
 SCANNED = 12  # moves that promise most
+LOOSELY, FEW = 0.1, 4  # of what a cause promises, what could stand for it must promise; how many are taken in any case
 
 
 @final
@@ -45,14 +47,11 @@ class Screen:
 
     def once(self, key: object, make: Callable[[], Any]) -> Any:
         """What is made for these windows, made the first time."""
-        if key not in self._made:
-            self._made[key] = make()
-        return self._made[key]
+        return once(self._made, key, make)
 
     def _shown(self, model: Model) -> Array:
         """Outputs (W, L, ny) along the path of a model whose extensions are off."""
-        found: Array = self.once(("shown", id(model)), lambda: self.path.output(model, {}))
-        return found
+        return np.asarray(self.once(("shown", id(model)), lambda: self.path.output(model, {})))
 
     def push(self, c: Candidate) -> Push:
         if c.key not in self._pushes:
@@ -116,72 +115,58 @@ class Screen:
         state = self._moved(model, dict(zip(names, values.T, strict=True)), len(values))
         return Push(c, values, np.ascontiguousarray(state), None)
 
+    def push_at(self, c: Candidate, values: Mapping[str, float]) -> Push:
+        return self.pushed(c, np.array([[values[n] for n in self.library.names(c)]]))
+
     def silent(self, c: Candidate, values: Mapping[str, float], before: float) -> bool:
         """Does a cause do nothing in the windows that begin before a time?"""
-        push = self.pushed(c, np.array([[values[n] for n in self.library.names(c)]]))
+        push = self.push_at(c, values)
         early = self.windows.t < before
         return push.state is not None and bool(np.any(push.state)) and not np.any(push.state[early])
 
-    def ranked(self, fits: Sequence[tuple[Fit, int]], moves: Sequence[Causes]) -> list[list[Screened]]:
+    def rank(self, fits: Sequence[tuple[Fit, int]], moves: Sequence[Causes]) -> list[list[Promise]]:
         """Per fit, whose windows are these cut into so many parts, the moves by their promise, best first."""
-        motion = Motion.of(self.path, fits[0][0])
         out = []
-        for fit, parts in fits:
-            ledger = self.ledger(motion, fit, parts, dict.fromkeys(c for move in moves for c in move))
-            found = _sorted(ledger, moves)
+        for table in self.tables(fits, dict.fromkeys(c for move in moves for c in move)):
+            found = _sorted(table, moves)
             best = [s.move for s in found[:SCANNED]]
-            self._scan(ledger, dict.fromkeys(c for move in best for c in move))
-            out.append(_sorted(ledger, best) + found[SCANNED:])
+            self._scan(table, dict.fromkeys(c for move in best for c in move))
+            out.append(_sorted(table, best) + found[SCANNED:])
         return out
 
-    def pairs(self, fits: Sequence[tuple[Fit, int]], most: int) -> list[Screened]:
-        """Per fit as in `ranked`, two candidates at once by their promise."""
+    def tables(self, fits: Sequence[tuple[Fit, int]], candidates: Collection[Candidate] | None = None) -> Iterator[GainTable]:
+        """Per fit as in `rank` the gains of candidates, by default of all; of a fit without causes they are kept."""
         motion = Motion.of(self.path, fits[0][0])
-        return [s for fit, parts in fits for s in self.ledger(motion, fit, parts, self.library.candidates).pairs(most)]
+        for fit, parts in fits:
+            make = functools.partial(GainTable, self.library, self.windows, self.rows, motion, fit, parts)
+            table: GainTable = make() if fit.hypothesis.charged else self.once(("gains", id(fit), parts), make)
+            new = [c for c in (self.library.candidates if candidates is None else candidates) if c.key not in table.entered]
+            self._at_once(new)
+            table.enter([self.push(c) for c in new])
+            yield table
 
-    def pursued(self, fits: Sequence[tuple[Fit, int]], most: int) -> Iterator[tuple[list[Screened], list[float]]]:
-        """Per fit as in `ranked`, sets of candidates that are piled up greedily, and their gains."""
-        motion = Motion.of(self.path, fits[0][0])
-        return (self.ledger(motion, fit, parts, self.library.candidates).pursued(most) for fit, parts in fits)
-
-    def promise(self, fit: Fit, parts: int, c: Candidate) -> Screened | None:
-        """Of one candidate by itself."""
-        return self.ledger(Motion.of(self.path, fit), fit, parts, (c,)).promise((c,))
-
-    def beside(self, fit: Fit, parts: int, causes: Causes) -> dict[tuple[str, str], float]:
-        """Per candidate what it promises to a fit beside these causes, their columns being those of that fit."""
-        return self.ledger(Motion.of(self.path, fit), fit, parts, self.library.candidates).beside(causes)
-
-    def ledger(self, motion: Motion, fit: Fit, parts: int, candidates: Iterable[Candidate]) -> Ledger:
-        """Of a fit without causes it is kept: most questions begin there."""
-        key = "ledger", id(fit), parts
-        ledger: Ledger = (
-            Ledger(self.library, self.windows, self.rows, motion, fit, parts)
-            if fit.hypothesis.charged
-            else self.once(key, lambda: Ledger(self.library, self.windows, self.rows, motion, fit, parts))
-        )
-        new = [c for c in candidates if c.key not in ledger.entered]
-        self._at_once(new)
-        ledger.enter([self.push(c) for c in new])
-        return ledger
-
-    def _scan(self, ledger: Ledger, candidates: Iterable[Candidate]) -> None:
+    def _scan(self, table: GainTable, candidates: Iterable[Candidate]) -> None:
         """Needles: more values about the best of many."""
         for c in candidates:
-            if c.key in ledger.columns:
-                finer = _between(ledger.columns[c.key].values, ledger.best(c), self.library.amplitude(c))
+            if c.key in table.columns:
+                finer = _between(table.columns[c.key].values, table.best(c), self.library.amplitude(c))
                 if len(finer):
-                    ledger.enter([self.pushed(c, finer)])
-
-    def least(self, fit: Fit, gain: float) -> list[tuple[Candidate, Array]]:
-        """Per candidate the smallest values that would have promised so much."""
-        ledger = self.ledger(Motion.of(self.path, fit), fit, 1, self.library.candidates)
-        found = [(c, ledger.least(c, gain)) for c in self.library.candidates]
-        return [(c, values) for c, values in found if values is not None]
+                    table.enter([self.pushed(c, finer)])
 
 
-def _sorted(ledger: Ledger, moves: Sequence[Causes]) -> list[Screened]:
-    return sorted((s for move in moves if (s := ledger.promise(move)) is not None), key=lambda s: -s.gain)
+def standing_in(moves: Sequence[Causes], gains: Mapping[tuple[str, str], float], cause: tuple[str, str]) -> list[Causes]:
+    """Single moves that promise some of what a cause does, the best few in any case, and the cause itself.
+
+    Those without a column, which lift the tolerance of a number that is free already, cost nothing to ask.
+    """
+    best = sorted(gains, key=lambda k: -gains[k])[:FEW]
+    near = {k for k, gain in gains.items() if gain > LOOSELY * gains.get(cause, 0.0)}
+    kept = {*near, *best, cause}
+    return [m for m in moves if len(m) == 1 and (m[0].key in kept or m[0].key not in gains)]
+
+
+def _sorted(table: GainTable, moves: Sequence[Causes]) -> list[Promise]:
+    return sorted((s for move in moves if (s := table.promise(move)) is not None), key=lambda s: -s.gain)
 
 
 def _distinct(values: Array, amplitude: int | None) -> Array:

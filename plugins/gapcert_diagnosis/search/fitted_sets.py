@@ -1,0 +1,211 @@
+"""Sets of causes on some windows: each fitted once, and what screening promises beside it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from typing import final
+
+from gapcert_diagnosis.data.dataset import Windows
+from gapcert_diagnosis.fitting.fit import Fit, carried, fit
+from gapcert_diagnosis.fitting.restarts import rescued
+
+from .candidates import Candidate, Causes, Library, once
+from .criterion import Found, Keys, better, decides, keys, named, noise, numbers, pays, rough_charge, values
+from .effect_size import negligible
+from .gains import Promise
+from .screening import Screen, standing_in
+
+FIRST, SECOND = 4, 6  # iterations of a short fit; of the longer of two
+SHORT = 0.3  # s: windows of the short fits
+CROWD = 100  # candidates from which sets are piled up
+SHAKES = (0.93, 1.05)  # restarts of dry laws that are close to the best, but not yet at the noise
+
+Promised = tuple[list[Promise], list[Promise]]
+
+
+def untold(text: str, best: Mapping[str, str] | None = None, fitted: bool = True) -> None:
+    """Progress that nobody follows."""
+
+
+@final
+class FittedSets:
+    """Sets of causes on some windows, each fitted once to long windows and once to short ones, into which these are cut.
+
+    cautious: rough fits are judged by what the windows agree on, not by how many samples they have. added: sets → fits of these
+    with one move more. lost: sets that are so far behind on short windows that long ones do not matter; negligible: (effect,
+    site) → share of the effort of what was met and found too small.
+    """
+
+    def __init__(
+        self, library: Library, windows: Windows, progress: Callable[..., None] = untold, plain: Fit | None = None
+    ) -> None:
+        """plain: the fit of nothing, where it is known."""
+        self.library, self.windows, self.progress = library, windows, progress
+        self.parts = max(1, windows.length // windows.measured.brief(SHORT))
+        self._fits: dict[Keys, Found] = {}
+        self._brief: dict[Keys, Fit] = {}
+        self._promised: dict[tuple[Keys, tuple[str, str] | None], Promised] = {}
+        self.added: dict[Keys, list[Found]] = {}
+        self.cautious = False
+        self.lost: set[Keys] = set()
+        self.negligible: dict[tuple[str, str], float] = {}
+        self.nothing = self.fit((), None) if plain is None else self._keep((), rescued(plain, windows))
+
+    @cached_property
+    def screen(self) -> Screen:
+        return Screen(self.library, self.windows, self.nothing, lambda text: self.progress(text, self._so_far(), fitted=False))
+
+    @cached_property
+    def short(self) -> Windows:
+        return self.windows.cut(self.parts)
+
+    def _so_far(self) -> dict[str, str]:
+        """The set with the least error on the fitted windows, and the share of it that is left: what one sees meanwhile."""
+        tried = [found for found in self._fits.values() if found[0]]
+        if not tried or (before := float(self.nothing.chi.sum())) <= 0:
+            return {}
+        causes, least = min(tried, key=lambda found: float(found[1].chi.sum()))
+        return {"best": named(causes), "error left": f"{math.sqrt(float(least.chi.sum()) / before):.0%}"}
+
+    def fit(self, causes: Causes, base: Found | None, start: Mapping[str, float] | None = None) -> Fit:
+        """On long windows, kept; from `start`, or from `base`, the fit of a set that differs little, and from screening."""
+        if keys(causes) not in self._fits:
+            self.progress(named(causes), self._so_far())
+            self.fit_again(causes, base, start)
+        return self._fits[keys(causes)][1]
+
+    def known(self, causes: Causes) -> Fit | None:
+        """The fit of a set, if it was ever made."""
+        return self._fits[keys(causes)][1] if keys(causes) in self._fits else None
+
+    def fit_again(self, causes: Causes, base: Found | None, start: Mapping[str, float] | None = None) -> Fit:
+        """A fit from other first values; the better one is kept."""
+        h, known = self.library.hypothesis(causes), {} if base is None else values(base[1])
+        if base is not None and start is None:
+            start = self._first(causes, base)
+        fewer = base is not None and keys(causes) < keys(base[0]) and len(base[1].start) == len(self.windows)
+        theta = numbers(h, {**known, **(start or {})})
+        new = fit(h, self.windows, theta=theta, start=base[1].start if base and fewer else None)
+        return self._keep(causes, rescued(new, self.windows))
+
+    def fit_from(self, causes: Causes, other: Fit) -> Fit:
+        """The fit of a set from its numbers on other windows; starts that are not known from there follow these first."""
+        if keys(causes) not in self._fits:
+            h = self.library.hypothesis(causes)
+            theta = numbers(h, values(other))
+            closest = min((f for _, f in self._fits.values()), key=lambda f: float(f.chi.sum()))
+            start = carried(h, theta, other, self.windows, closest.start)
+            self._keep(causes, rescued(fit(h, self.windows, theta=theta, start=start), self.windows))
+        return self._fits[keys(causes)][1]
+
+    def _keep(self, causes: Causes, new: Fit) -> Fit:
+        old = self.known(causes)
+        if old is None or self.better(new, old) > 0:
+            self._fits[keys(causes)] = causes, new
+        return self._fits[keys(causes)][1]
+
+    def fit_shaken(self, causes: Causes, base: Found) -> Fit:
+        """The best of a fit and of fresh ones from nearby: sticking puts kinks into the cost, and a fit may catch on one."""
+        best, dry = self.fit(causes, base), self.library.dry(causes)
+        for factor in SHAKES if dry and not noise(best) else ():
+            shaken = {n: v * factor if n in dry else v for n, v in values(best).items()}
+            self.fit_again(causes, None, shaken)
+        return self._fits[keys(causes)][1]
+
+    def brief(self, base: Found) -> Fit:
+        """The set of a long fit, fitted to the short windows."""
+        h, theta = base[1].hypothesis, base[1].theta
+        return once(self._brief, keys(base[0]), lambda: fit(h, self.short, theta=theta, iterations=FIRST))
+
+    def fits(self, base: Found) -> list[tuple[Fit, int]]:
+        """Of a set to long and to short windows, and how many of these a long one has."""
+        return [(base[1], 1), (self.brief(base), self.parts)]
+
+    def try_move(self, base: Found, s: Promise, iterations: int = FIRST) -> Fit:
+        """A set with a move more, fitted to the short windows from what is promised."""
+        h, brief = self.library.hypothesis((*base[0], *s.move)), self.brief(base)
+        theta = numbers(h, values(brief) | dict(s.values))
+        return fit(h, self.short, theta=theta, start=brief.start, iterations=iterations)
+
+    def fit_further(self, first: Fit, iterations: int = SECOND) -> Fit:
+        """A fit to the short windows, gone on with."""
+        return fit(first.hypothesis, self.short, theta=first.theta, start=first.start, iterations=iterations)
+
+    def promises(self, base: Found, instead: Candidate | None = None) -> Promised:
+        """All moves by their promise on short and on long windows; of very many those that could stand for `instead`."""
+        key = keys(base[0]), None if instead is None or len(self.library.candidates) < CROWD else instead.key
+        if key not in self._promised:
+            moves = [m for m in self.library.moves if not keys(m) & key[0]]
+            if key[1] is not None:
+                (table,) = self.screen.tables(self.fits(((), self.nothing))[1:])
+                moves = standing_in(moves, table.beside(base[0]), key[1])
+            long, short = self.screen.rank(self.fits(base), moves)
+            self._promised[key] = short, long
+        return self._promised[key]
+
+    def promise(self, base: Found, c: Candidate) -> Promise | None:
+        """Of one candidate beside a set."""
+        known = [p for (k, instead), p in self._promised.items() if k == keys(base[0]) and instead]
+        if (found := _first_of(known, c)) is not None:
+            return found
+        if not base[0] and len(self.library.candidates) >= CROWD:
+            # The pile has entered all of them.
+            (table,) = self.screen.tables(self.fits(base)[1:], (c,))
+            return table.promise((c,))
+        return _first_of([self.promises(base)], c)
+
+    def _first(self, causes: Causes, base: Found) -> dict[str, float]:
+        """What screening promises for the causes that the base lacks."""
+        out: dict[str, float] = {}
+        for c in causes:
+            if c.key not in keys(base[0]):
+                found = self.promise(base, c) or self.promise(((), self.nothing), c)
+                names = self.library.names(c)
+                out |= found.values if found else dict(zip(names, self.library.starts(c)[0].tolist(), strict=True))
+        return out
+
+    def carry(self, old: Candidate, new: Candidate, found: Found, default: bool = True) -> dict[str, float]:
+        """First values of one law from those of another that it contains, or that contains it."""
+        fitted = values(found[1])
+        mine, theirs = (
+            dict(zip((p.name for p in c.effect.parameters), self.library.names(c), strict=True)) for c in (new, old)
+        )
+        out: dict[str, float] = self._first((new,), ((), self.nothing)) if default else {}
+        for m, t in new.effect.contains.get(old.effect.name, {}).items():
+            out[mine[m]] = fitted[theirs[t]]
+        for t, m in old.effect.contains.get(new.effect.name, {}).items():
+            out[mine[m]] = fitted[theirs[t]]
+        return out
+
+    def better(self, new: Fit, old: Fit) -> float:
+        return better(new, old, self.cautious)
+
+    def pays(self, found: Found, before: Found) -> bool:
+        return pays(found[1], before[1], *self.charges(found, before))
+
+    def charges(self, found: Found, before: Found) -> tuple[float, float | None]:
+        """What a larger set must bring: where samples are counted, and where a cautious search finds both fits rough."""
+        return self.library.threshold, rough_charge(self.library, found[0], before[0]) if self.cautious else None
+
+    def small(self, found: Found) -> dict[tuple[str, str], float]:
+        """(effect, site) → share of the effort of causes that are too small to be named."""
+        return {(effect, site): share for effect, site, share in negligible(self.screen, found[0], values(found[1]))}
+
+    def matters(self, found: Found) -> bool:
+        """Is every cause larger than what an integrator may leave, or than a stated tolerance? What is not, is noted.
+
+        Where almost nothing rubs, a thousandth of the effort may be all that is wrong: then it decides what windows look like.
+        """
+        small = {key: share for key, share in self.small(found).items() if not self.decides(found, key)}
+        self.negligible |= small
+        return not small
+
+    def decides(self, found: Found, key: tuple[str, str]) -> bool:
+        return decides(found[1], self.fit(tuple(c for c in found[0] if c.key != key), found))
+
+
+def _first_of(promised: Sequence[Promised], c: Candidate) -> Promise | None:
+    """What is promised of one candidate alone, on long windows if it is known there."""
+    return next((s for short, long in promised for s in (*long, *short) if keys(s.move) == {c.key}), None)
