@@ -19,12 +19,6 @@ from .config import EngineConfig
 from .contract import ENDLESS, Engine, EngineWorld, Joint
 from .wiring import Lever, check_ranges, from_columns, step_period, to_columns, wire
 
-
-def as_backend(engine: Callable[[Any, Path], Engine], config: EngineConfig, context: Context) -> EngineBackend:
-    """`from_config` of an engine: the backend of a spec's section, with the axes of the model that there is."""
-    return EngineBackend(engine(config, context.folder), model=context.model)
-
-
 _SMALL_REMAINDER = 4
 """Fewer rows than this are stepped one by one: a block costs as much as four single rows, a large one as copies / 12."""
 
@@ -272,3 +266,8 @@ class EngineBackend(Backend):
             if one.tobytes() != many.tobytes():
                 return False
         return True
+
+
+def as_backend(engine: Callable[[Any, Path], Engine], config: EngineConfig, context: Context) -> EngineBackend:
+    """`from_config` of an engine: the backend of a spec's section, with the axes of the model that there is."""
+    return EngineBackend(engine(config, context.folder), model=context.model)

@@ -11,6 +11,7 @@ from typing import Any, final
 import numpy as np
 
 from gapcert import Array, Parameter, StateSpec, UsageError
+from gapcert_engines import Engine
 
 OURS = "gymnasium.envs."
 
@@ -210,9 +211,7 @@ class MuJoCo(Adapter):
             fills += env.init_qpos[at : at + count].tolist()
         self.state, self.rest = (*places, *rates), (*fills, *(0.0,) * model.nv)
         self.action = tuple(StateSpec(model.actuator(k).name or f"action[{k}]") for k in range(model.nu))
-        self.parameters = tuple(
-            Parameter(f"gravity_{a}", float(g), "m/s^2") for a, g in zip("xyz", model.opt.gravity, strict=True)
-        )
+        self.parameters = Engine.gravity_parameters(model.opt.gravity.tolist())
         self.period = float(env.dt)
 
     def adjust(self, values: Mapping[str, float]) -> None:

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from gapcert import Parameter
+from gapcert_engines import Engine
 
 from .robot import touches
 
@@ -36,27 +37,28 @@ class Natives:
     """
 
     def __init__(self, one: Any, copies: int = 1) -> None:
-        self.parameters = [Parameter(f"gravity_{a}", float(g), "m/s^2") for a, g in zip("xyz", one.opt.gravity, strict=True)]
+        self.parameters = list(Engine.gravity_parameters(one.opt.gravity.tolist()))
         self._places: list[tuple[str, str, Any]] = []
         again = np.arange(copies)
         for k in range(one.njnt):
             units = UNITS.get(mujoco.mjtJoint(one.jnt_type[k]), {})
             dof = int(one.jnt_dofadr[k])
             for what, unit in units.items():
-                self._add(f"{what}.{joint_name(one, k)}", f"dof_{what}", one, dof, dof + one.nv * again, unit, 0.0, np.inf)
+                value = float(getattr(one, f"dof_{what}")[dof])
+                parameter = Parameter(f"{what}.{joint_name(one, k)}", value, unit, low=0.0)
+                self._add(parameter, f"dof_{what}", dof + one.nv * again)
         for k in range(1, one.nbody):
             # A body that is welded to the world has no part in the motion.
             if one.body_mass[k] > 0 and one.body_weldid[k]:
                 mass, name = float(one.body_mass[k]), one.body(k).name or f"body{k}"
                 places = k + (one.nbody - 1) * again
-                self._add(f"mass.{name}", "body_mass", one, k, places, "kg", 1e-3 * mass, 1e3 * mass)
+                self._add(Parameter(f"mass.{name}", mass, "kg", low=1e-3 * mass, high=1e3 * mass), "body_mass", places)
                 # Of a simple body MuJoCo takes for granted that the centre of mass is its origin.
                 for axis, a in enumerate("" if one.body_simple[k] else "xyz"):
-                    self.parameters.append(Parameter(f"com_{a}.{name}", float(one.body_ipos[k, axis]), "m"))
-                    self._places.append((f"com_{a}.{name}", "body_ipos", (places, axis)))
+                    self._add(Parameter(f"com_{a}.{name}", float(one.body_ipos[k, axis]), "m"), "body_ipos", (places, axis))
                 moment = float(one.body_inertia[k].max())
-                self.parameters.append(Parameter(f"inertia.{name}", moment, "kg*m^2", low=1e-3 * moment, high=1e3 * moment))
-                self._places.append((f"inertia.{name}", "body_inertia", places))
+                least, most = 1e-3 * moment, 1e3 * moment
+                self._add(Parameter(f"inertia.{name}", moment, "kg*m^2", low=least, high=most), "body_inertia", places)
         self.frictional = touches(one)
         if self.frictional:
             self.parameters += [
@@ -72,9 +74,9 @@ class Natives:
         self._stated = {p.name: p.value for p in self.parameters}
         self._made: dict[tuple[float, ...], tuple[Any, Any]] = {}
 
-    def _add(self, name: str, field: str, one: Any, index: int, places: Any, unit: str, low: float, high: float) -> None:
-        self.parameters.append(Parameter(name, float(getattr(one, field)[index]), unit, low=low, high=high))
-        self._places.append((name, field, places))
+    def _add(self, parameter: Parameter, field: str, places: Any) -> None:
+        self.parameters.append(parameter)
+        self._places.append((parameter.name, field, places))
 
     @staticmethod
     def dry(values: Mapping[str, float]) -> bool:

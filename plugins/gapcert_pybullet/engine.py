@@ -13,11 +13,12 @@ from gapcert import Array, Parameter, UsageError
 from gapcert.plugin import Scene
 from gapcert_engines import Drive, Engine, as_backend, file_shapes
 
+from .client import JOINTS_AT_MOST, Client
 from .config import PyBulletConfig
 from .patch import files
 from .section import section
 from .urdf import RobotFile
-from .world import JOINTS_AT_MOST, Client, PyBulletWorld
+from .world import PyBulletWorld
 
 
 @final

@@ -10,14 +10,11 @@ import numpy as np
 from gapcert import Array
 from gapcert_engines import Drive, EngineWorld
 
-from .client import JOINTS_AT_MOST, Client, pybullet
+from .client import Client, pybullet
 
 if TYPE_CHECKING:
     from .config import PyBulletConfig
     from .urdf import RobotFile
-
-
-__all__ = ["JOINTS_AT_MOST", "Client", "PyBulletWorld", "fuses"]
 
 
 def fuses(period: float, substeps: int) -> bool:
