@@ -205,13 +205,11 @@ class Symbolic(Synthesizer):
         def windows_on(grid: Grid, cell: Ints) -> Windows:
             added = None if problem.gap is None else disturbance(problem.gap, grid, plan.axes, tick=tick("gap over cells"))
             bound = self._bound(problem.model, grid)
-            return windows(bound, grid, plan.axes, added, tick=tick("successors of cells"), cell=cell)
-
-        def offer(grid: Grid, cell: Ints) -> Bools | None:
-            return offered(problem.domain, grid, plan.axes, cell)
+            allowed = offered(problem.domain, grid, plan.axes, cell)
+            return windows(bound, grid, plan.axes, added, allowed=allowed, tick=tick("successors of cells"), cell=cell)
 
         by = refined if problem.goal.automaton is None else refined_product
-        return by(problem.goal, self.refine, made.solution, made.paths(), windows_on, offer)
+        return by(problem.goal, self.refine, made.solution, made.paths(), windows_on)
 
     def _made(self, problem: SynthesisProblem, plan: _Plan, added: Disturbance | None, tick: Any = None) -> _Made:
         """The fixpoint on a plan, with [l, u] over its cells."""

@@ -60,10 +60,10 @@ def on_levels(made: list[Windows], goal: Goal, allowed: np.ndarray | None = None
     """allowed: inputs by number that the cells of further levels may use."""
     by_grid = {w.grid.counts: w for w in made}
 
-    def offer(grid: Grid, cell: np.ndarray) -> np.ndarray | None:
-        return None if allowed is None else np.tile(allowed, (len(cell), 1))
+    def finer(grid: Grid, cell: np.ndarray) -> Windows:
+        return replace(by_grid[grid.counts], allowed=None if allowed is None else np.tile(allowed, (len(cell), 1)))
 
-    return refined(goal, len(made) - 1, solved(made[0], goal), made[0], lambda grid, _: by_grid[grid.counts], offer)
+    return refined(goal, len(made) - 1, solved(made[0], goal), made[0], finer)
 
 
 def painted(found: Refined, levels: int) -> np.ndarray:

@@ -71,8 +71,8 @@ def by_tables(
     bound: Enclosed, grid: Grid, axes: tuple[np.ndarray, ...], gap: Band | None, safe: np.ndarray
 ) -> solvers.Solution:
     paths = windows(bound, grid, axes, None if gap is None else disturbance(gap, grid, axes))
-    values, bits = np.where(safe, 0, -1).astype(np.int32), solvers._no_bits(paths)
-    runs.invariance(1, *solvers._given(paths), values, bits, solvers._allowed(paths), *paths.rows)
+    values, bits = np.where(safe, 0, -1).astype(np.int32), paths.no_bits
+    runs.invariance(1, paths.game, values, bits, *paths.rows)
     return solvers.Solution(values, bits, 1)
 
 

@@ -42,8 +42,8 @@ def drawn(rng: np.random.Generator, counts: tuple[int, ...], m: int, wraps: tupl
 def looked_at(windows: Windows, safe: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The other solver."""
     alive = np.where(safe, 0, -1).astype(np.int32)
-    bits = solvers._no_bits(windows)
-    runs.invariance(1, *solvers._given(windows), alive, bits, solvers._allowed(windows), *windows.rows)
+    bits = windows.no_bits
+    runs.invariance(1, windows.game, alive, bits, *windows.rows)
     return alive == 0, bits
 
 

@@ -17,7 +17,7 @@ from gapcert_symbolic.cells.abstraction import Axis, Windows
 from gapcert_symbolic.cells.bounds import Enclosed, Grown
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.kernels import lazy_kernels
-from gapcert_symbolic.solvers import lazy, runs, solvers
+from gapcert_symbolic.solvers import lazy, runs
 from gapcert_symbolic.synthesizer import Symbolic
 
 RANGES = {"omega": (-4.0, 4.0), "theta": (-np.pi, np.pi), "torque": (-6.0, 6.0)}
@@ -268,8 +268,8 @@ def test_drawn_windows(n: int) -> None:
     some = 0
     for seed in range(12 if n == 1 else 6):
         windows, safe = drawn(n, seed)
-        alive, bits = np.where(safe, 0, -1).astype(np.int32), solvers._no_bits(windows)
-        runs.invariance(1, *solvers._given(windows), alive, bits, solvers._allowed(windows), *windows.rows)
+        alive, bits = np.where(safe, 0, -1).astype(np.int32), windows.no_bits
+        runs.invariance(1, windows.game, alive, bits, *windows.rows)
         found, nested = lazy.invariance(hulls(windows), windows.grid, safe, windows.inputs, windows.allowed)
         assert nested
         assert np.array_equal(found.values, alive)

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from gapcert import Box, StateSpec
 from gapcert_symbolic.cells.abstraction import Axis, Windows
 from gapcert_symbolic.cells.grid import Grid
-from gapcert_symbolic.kernels import kernels
-from gapcert_symbolic.solvers import runs, solvers
+from gapcert_symbolic.solvers import runs
 
 
 def drawn(n: int, m: int, seed: int, order: int) -> tuple[Windows, np.ndarray]:
@@ -34,8 +33,8 @@ def drawn(n: int, m: int, seed: int, order: int) -> tuple[Windows, np.ndarray]:
 
 
 def solved(windows: Windows, safe: np.ndarray, allowed: np.ndarray, threads: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    alive, bits = np.where(safe, 0, -1).astype(np.int32), solvers._no_bits(windows)
-    runs.invariance(threads, *solvers._given(windows), alive, bits, allowed, *windows.rows)
+    alive, bits = np.where(safe, 0, -1).astype(np.int32), windows.no_bits
+    runs.invariance(threads, windows.game._replace(allowed=allowed), alive, bits, *windows.rows)
     return alive, bits
 
 
@@ -61,8 +60,7 @@ def textbook(windows: Windows, safe: np.ndarray) -> tuple[np.ndarray, np.ndarray
 @given(st.integers(1, 3), st.integers(1, 20), st.integers(0, 2**32 - 1), st.sampled_from([1, -1, 0]))
 def test_in_order_as_one_by_one(n: int, m: int, seed: int, order: int) -> None:
     windows, safe = drawn(n, m, seed, order)
-    _, wraps, packed = solvers._given(windows)
-    assert order == 0 or runs._sense(wraps, packed) in (order, 1)  # windows that are the same are in both orders
+    assert order == 0 or runs._sense(windows.game) in (order, 1)  # windows that are the same are in both orders
     both = np.empty((0, 0), dtype=bool), np.ones((len(safe), m), dtype=bool)
     found = [solved(windows, safe, allowed, threads) for allowed in both for threads in (1, 2)]
     for alive, bits in found:
@@ -84,12 +82,12 @@ def test_windows_in_no_order_are_not_taken_together() -> None:
     wrong = 0
     for seed in range(10):
         windows, safe = drawn(2, 9, seed, 0)
-        (counts, wraps, packed), (alive, bits) = solvers._given(windows), solved(windows, safe, np.empty((0, 0), dtype=bool))
-        assert runs._sense(wraps, packed) == 0
-        strides, run, other = kernels._strides(counts), np.empty(len(safe), np.int32), solvers._no_bits(windows)
-        runs._count(alive, counts[-1], run)
-        room = np.zeros((4, len(counts)), np.int64)
-        runs._valid_in_order(counts, wraps, packed, strides, alive, run, 1, other, room, 0, counts[0])
+        game, (alive, bits) = windows.game, solved(windows, safe, np.empty((0, 0), dtype=bool))
+        assert runs._sense(game) == 0
+        run, other, room = np.empty(len(safe), np.int32), windows.no_bits, np.zeros((4, len(game.counts)), np.int64)
+        runs._count(alive, game.counts[-1], run)
+        own = runs.Own(run, room[0], room[1:], np.zeros((2, 0), np.int64))
+        runs._valid_in_order(game, alive, own, 1, other, 0, game.counts[0])
         wrong += not np.array_equal(bits, other)
     assert wrong > 0
 
@@ -114,9 +112,8 @@ def test_threads_that_do_not_learn_what_died_keep_too_much(monkeypatch: pytest.M
 
 def test_an_axis_that_wraps_is_in_no_order() -> None:
     windows, _ = drawn(2, 5, 3, 1)
-    _, wraps, packed = solvers._given(windows)
-    assert runs._sense(wraps, packed) == 1
-    assert runs._sense(np.array([False, True]), packed) == 0
+    assert runs._sense(windows.game) == 1
+    assert runs._sense(windows.game._replace(wraps=np.array([False, True]))) == 0
 
 
 @settings(max_examples=40, deadline=None, derandomize=True)

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from gapcert import Array, Interval, UsageError
 from gapcert.plugin import Bools, Ints
+from gapcert_symbolic.kernels.kernels import Bits, Game, Packed, _strides
 
 from .bounds import Bound, Grown
 from .gaps import Disturbance, fitted
@@ -75,12 +76,9 @@ class Windows:
         return ends[0], ends[1]
 
     @property
-    def packed(self) -> tuple[Any, ...]:
-        """Tables of all axes in one, as the compiled solvers read them: (first, last, start, strides, moves, column).
-
-        The entry of axis k is at start_k + Σ_d index_d strides_kd + column_kj.
-        """
-        n = len(self.axes)
+    def game(self) -> Game:
+        """As the compiled solvers have it."""
+        n, offset = len(self.axes), [a.row * a.first.shape[1] for a in self.axes if a.row is not None]
         strides, start, at = np.zeros((n, n), dtype=np.int64), np.zeros(n, dtype=np.int64), 0
         for k, axis in enumerate(self.axes):
             start[k], step = at, axis.first.shape[1]
@@ -88,7 +86,30 @@ class Windows:
                 strides[k, d], step = step, step * self.grid.counts[d]
             at += axis.first.size
         first, last = (np.concatenate([getattr(a, end).ravel() for a in self.axes]) for end in ("first", "last"))
-        return first, last, start, strides, np.array([a.moves for a in self.axes]), np.stack([a.column for a in self.axes])
+        moves, column = np.array([a.moves for a in self.axes]), np.stack([a.column for a in self.axes])
+        rows, none = np.stack(offset) if offset else np.empty((n, 0), dtype=np.int64), np.empty(0, dtype=np.int64)
+        packed = Packed(first, last, start, strides, rows, moves, column)
+        counts, wraps = np.array(self.grid.counts), np.array(self.grid.wraps)
+        return Game(counts, wraps, _strides(counts), packed, self.permitted, self.grid.size, 0, counts, none, 0, none)
+
+    @property
+    def permitted(self) -> Bools:
+        """`allowed` as the compiled solvers have it: empty where it is None."""
+        return np.empty((0, 0), dtype=bool) if self.allowed is None else self.allowed
+
+    @property
+    def every(self) -> Bits:
+        """All inputs that the relations leave, packed: (cells, bytes), or (1, bytes) where they leave all."""
+        return np.packbits(np.ones((1, self.inputs), dtype=bool) if self.allowed is None else self.allowed, axis=1)
+
+    @property
+    def no_bits(self) -> Bits:
+        """(cells, bytes) of no inputs."""
+        return np.zeros((self.grid.size, (self.inputs + 7) // 8), dtype=np.uint8)
+
+    def offered(self, cells: Bools) -> Bits:
+        """All inputs that the relations leave, packed, in some of the cells (cells,)."""
+        return np.where(cells[:, None], self.every, np.uint8(0))
 
     @property
     def rows(self) -> tuple[Ints, Ints]:

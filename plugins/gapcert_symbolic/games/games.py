@@ -6,71 +6,33 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from gapcert import Box, Region
 from gapcert.plugin import Bools, Ints
 from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
-from gapcert_symbolic.kernels import kernels
-from gapcert_symbolic.solvers import solvers
+from gapcert_symbolic.kernels import sets
+from gapcert_symbolic.kernels.kernels import Bits
 from gapcert_symbolic.solvers.solvers import Compiled, Fixpoints, Solution
 
 CHUNK = 200_000
 ALONE = Compiled()
 
 
-@kernels.compiled
-def _lead(counts: Ints, wraps: Bools, packed: Any, values: kernels.Values, asked: Bools, allowed: Bools, bits: Any) -> None:
-    strides, m = kernels._strides(counts), packed[5].shape[1]
-    index, a, b, c = np.zeros((4, len(counts)), np.int64)
-    for i in range(len(values)):
-        if asked[i]:
-            for j in range(m):
-                if (not allowed.size or allowed[i, j]) and kernels._valid(
-                    counts, wraps, packed, strides, values, index, j, a, b, c
-                ):
-                    kernels._keep(bits, i, j)
-        kernels._next(counts, index)
-
-
-def leading(windows: Windows, into: Bools, asked: Bools) -> npt.NDArray[np.uint8]:
+def leading(windows: Windows, into: Bools, asked: Bools) -> Bits:
     """Per cell that is asked for, all inputs that lead wholly into the cells `into`; packed."""
-    bits = solvers._no_bits(windows)
-    values = np.where(into, 0, -1).astype(np.int32)
-    _lead(*solvers._given(windows), values, asked, solvers._allowed(windows), bits)
+    bits = windows.no_bits
+    sets.leading(windows.game, np.where(into, 0, -1).astype(np.int32), asked, bits)
     return bits
 
 
-@kernels.compiled
-def _remain(counts: Ints, wraps: Bools, packed: Any, values: kernels.Values, cells: Ints, allowed: Bools) -> None:
-    strides, m, sweeps, lost = kernels._strides(counts), packed[5].shape[1], 0, True
-    index, a, b, c = np.zeros((4, len(counts)), np.int64)
-    witness = np.zeros(len(cells), np.int64)
-    while lost:
-        lost = False
-        for t in range(len(cells)):
-            at = t if sweeps % 2 == 0 else len(cells) - 1 - t
-            i, j = cells[at], witness[at]
-            if values[i] == 0:
-                kernels._unravel(strides, i, index)
-                # What led out of a larger set leads out of a smaller one.
-                while j < m and not (
-                    (not allowed.size or allowed[i, j])
-                    and kernels._valid(counts, wraps, packed, strides, values, index, j, a, b, c)
-                ):
-                    j += 1
-                witness[at] = j
-                if j == m:
-                    values[i], lost = -1, True
-        sweeps += 1
-
-
-def remaining(windows: Windows, won: Bools, some: Bools) -> Bools:
-    """νY. some ∩ Pre(won ∪ Y): of some cells, those from which one can remain among them until one comes to what is won."""
-    values, cells = np.where(won | some, 0, -1).astype(np.int32), np.flatnonzero(some)
-    _remain(*solvers._given(windows), values, cells, solvers._allowed(windows))
-    return np.asarray(some & (values == 0))
+def remaining(windows: Windows, won: Bools, some: Bools) -> tuple[Bools, Bits]:
+    """νY. some ∩ Pre(won ∪ Y): of some cells, those from which one can remain among them until one comes to what is won; and
+    the inputs that do so.
+    """
+    values, bits = np.where(some, 0, np.where(won, 1, -1)).astype(np.int32), windows.no_bits
+    sets.invariance(windows.game, values, bits, np.stack(windows.reach))
+    return values == 0, bits
 
 
 def reach_and_stay(windows: Windows, safe: Bools, target: Bools, by: Fixpoints = ALONE) -> Solution:
@@ -92,8 +54,8 @@ def reach_and_stay(windows: Windows, safe: Bools, target: Bools, by: Fixpoints =
         values[later] = level + way.values[later]
         bits, rounds = np.where(later[:, None], way.bits, bits), rounds + way.rounds
         won = values >= 0
-        fresh = remaining(windows, won, safe & target & ~won)
-        bits = np.where(fresh[:, None], leading(windows, won | fresh, fresh), bits)
+        fresh, own = remaining(windows, won, safe & target & ~won)
+        bits = np.where(fresh[:, None], own, bits)
     return Solution(values, bits, rounds, tuple(lasting) or (0,))
 
 

@@ -111,7 +111,7 @@ class _Game:
             [jnp.asarray(np.ascontiguousarray(end.T).reshape(end.shape[1], *shape)) for end in (axis.first, axis.last)]
             for axis, shape in zip(windows.axes, shapes, strict=True)
         ]
-        self.allowed = self._shaped(_all(windows))
+        self.allowed = self._shaped(windows.every)
         self._kept, self._grown = _compiled(grid.counts, grid.wraps, tuple(axis.moves for axis in windows.axes))
 
     def _shaped(self, packed: Any) -> Any:
@@ -143,12 +143,6 @@ class _Game:
 
     def grown(self, won: Any, left: Any, values: Any, inputs: Any, level: int) -> Any:
         return self._grown(won, left, values, inputs, np.int32(level), self.column, self.tables, self.allowed)
-
-
-def _all(windows: Windows) -> Any:
-    """What relations leave, packed: (cells, bytes), or (1, bytes) without relations."""
-    allowed = np.ones((1, windows.inputs), dtype=bool) if windows.allowed is None else windows.allowed
-    return np.packbits(allowed, axis=1)
 
 
 @functools.cache

@@ -9,9 +9,11 @@ from typing import Protocol, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.plugin import Bools, Ints
+from gapcert.plugin import Bools
+from gapcert_symbolic.cells import repeats
 from gapcert_symbolic.cells.abstraction import Windows
-from gapcert_symbolic.kernels import inverse, kernels
+from gapcert_symbolic.kernels import inverse, reach
+from gapcert_symbolic.kernels.kernels import whole
 
 from . import erosion, runs
 
@@ -68,8 +70,8 @@ def invariance(windows: Windows, safe: Bools, threads: int = 1) -> Solution:
     if (order := erosion.order(windows)) is not None:
         alive, bits, rounds = erosion.invariance(windows, safe, order, threads)
         return Solution(np.where(alive, 0, -1).astype(np.int32), bits, rounds)
-    values, bits = np.where(safe, 0, -1).astype(np.int32), _no_bits(windows)
-    rounds = runs.invariance(threads, *_given(windows), values, bits, _allowed(windows), *windows.rows)
+    values, bits = np.where(safe, 0, -1).astype(np.int32), windows.no_bits
+    rounds = runs.invariance(threads, windows.game, values, bits, *windows.rows)
     return Solution(values, bits, rounds)
 
 
@@ -79,40 +81,9 @@ def reach_avoid(windows: Windows, safe: Bools, target: Bools, threads: int = 1) 
     Target cells have value 0 and every input that is allowed: the promise ends there.
     """
     fresh = target & safe
-    values = np.where(fresh, 0, np.where(safe, -1, -2)).astype(np.int32)
-    bits = _no_bits(windows)
-    bits[fresh] = np.packbits(np.ones(windows.inputs, dtype=bool))
-    if windows.allowed is not None:
-        bits[fresh] = np.packbits(windows.allowed[fresh], axis=1)
-    allowed = _allowed(windows)
-    rounds = inverse.reach(windows, values, bits, allowed, threads)
-    if rounds is None:
-        whole = np.int32 if windows.grid.size * windows.inputs < 2**31 else np.int64
-        head, following = np.full(windows.grid.size, -1, whole), np.empty(windows.grid.size * windows.inputs, whole)
-        rounds = kernels.reach(*_given(windows), values, bits, allowed, _near(windows, fresh), head, following)
-    return Solution(np.maximum(values, -1), bits, rounds)
-
-
-def _given(windows: Windows) -> tuple[Ints, Bools, tuple[npt.NDArray[np.generic], ...]]:
-    return np.array(windows.grid.counts), np.array(windows.grid.wraps), windows.packed
-
-
-def _allowed(windows: Windows) -> Bools:
-    return np.empty((0, 0), dtype=bool) if windows.allowed is None else windows.allowed
-
-
-def _no_bits(windows: Windows) -> npt.NDArray[np.uint8]:
-    return np.zeros((windows.grid.size, (windows.inputs + 7) // 8), dtype=np.uint8)
-
-
-def _near(windows: Windows, marked: Bools) -> tuple[Ints, Ints]:
-    """First and last index of each axis between which windows may touch a marked cell."""
-    low, high = np.empty((2, len(windows.axes)), dtype=np.int64)
-    cells, (least, most) = marked.reshape(windows.grid.counts), windows.reach
-    for k, n in enumerate(cells.shape):
-        rows = np.flatnonzero(cells.any(axis=tuple(j for j in range(cells.ndim) if j != k)))
-        if windows.grid.wraps[k] and len(rows):
-            low[k], high[k] = 0, n - 1
-        else:
-            low[k], high[k] = (rows[0] - most[k], rows[-1] - least[k]) if len(rows) else (n, -1)
-    return low, high
+    values, bits = np.where(fresh, 0, np.where(safe, -1, -2)).astype(np.int32), windows.offered(fresh)
+    if (given := repeats.inverse(windows, whole(windows.grid.size * windows.inputs))) is None:
+        reach.reach(windows.game, values, bits)
+    else:
+        inverse.reach(given, values, bits, windows.permitted, threads)
+    return Solution(np.maximum(values, -1), bits, int(values.max(initial=0)))
