@@ -26,7 +26,7 @@ from gapcert_symbolic.games import games, refined_automata
 from gapcert_symbolic.games.automata import Labels, leads_of, product, started
 from gapcert_symbolic.games.refined_automata import refined_product
 from gapcert_symbolic.games.refinement import Refined
-from gapcert_symbolic.solvers.solvers import Solution
+from gapcert_symbolic.solvers.problem import Solution
 from gapcert_symbolic.synthesizer import Symbolic
 
 AUTOMATA = [*map(automaton_of, ("F (a & F b)", "F a & F b", "!a U b", "F (a & X b)")), read_hoa(AGAIN)]

@@ -25,7 +25,8 @@ from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.games import games, refinement
 from gapcert_symbolic.games.refinement import Refined, refined
-from gapcert_symbolic.solvers import solvers
+from gapcert_symbolic.solvers.problem import Problem, Solution
+from gapcert_symbolic.solvers.solvers import solve
 from gapcert_symbolic.synthesizer import Symbolic
 
 GOALS = ("invariance", "reach_avoid", "reach_and_stay", "recurrence")
@@ -48,12 +49,12 @@ def masks(grid: Grid, goal: Goal) -> tuple[np.ndarray, np.ndarray]:
     return safe, np.zeros(grid.size, dtype=bool) if goal.target is None else games.inside(grid, goal.target)
 
 
-def solved(windows: Windows, goal: Goal) -> solvers.Solution:
+def solved(windows: Windows, goal: Goal) -> Solution:
     safe, target = masks(windows.grid, goal)
-    if goal.target is None:
-        return solvers.invariance(windows, safe)
-    by_kind = {"reach_avoid": solvers.reach_avoid, "reach_and_stay": games.reach_and_stay, "recurrence": games.recurrence}
-    return by_kind[goal.kind](windows, safe, target)
+    problem = Problem(lambda: windows, safe)
+    if goal.kind in ("invariance", "reach_avoid"):
+        return solve(problem if goal.target is None else replace(problem, target=target))
+    return {"reach_and_stay": games.reach_and_stay, "recurrence": games.recurrence}[goal.kind](problem, target)
 
 
 def on_levels(made: list[Windows], goal: Goal, allowed: np.ndarray | None = None) -> Refined:

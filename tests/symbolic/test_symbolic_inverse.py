@@ -11,12 +11,14 @@ from hypothesis import strategies as st
 
 from gapcert import Box, StateSpec
 from gapcert.plugin import Automaton, Bools
+from gapcert_cells import Along
 from gapcert_symbolic.cells import repeats
-from gapcert_symbolic.cells.abstraction import Axis, Windows
+from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.games import automata
 from gapcert_symbolic.kernels import inverse, reach
 from gapcert_symbolic.solvers import solvers
+from gapcert_symbolic.solvers.problem import Play
 
 TURN = 2 * np.pi
 
@@ -34,7 +36,7 @@ def drawn(rng: np.random.Generator, counts: tuple[int, ...], m: int, wraps: tupl
         first = rng.integers(-3, 3, size) if moves else rng.integers(-1, n + 1, size)
         first = first % n if wraps[k] else first
         last = first + rng.integers(0, min(3, n), size)
-        axes.append(Axis(on, moves, column, first.astype(np.int32), last.astype(np.int32)))
+        axes.append(Along(on, moves, column, first.astype(np.int32), last.astype(np.int32)))
     allowed = rng.random((grid.size, m)) < 0.8 if relations else None
     return Windows(grid, tuple(axes), allowed)
 
@@ -87,8 +89,8 @@ def test_no_classes_where_every_axis_matters() -> None:
     grid = Grid(Box((StateSpec("a"), StateSpec("b")), (0, 0), (1, 1)), (5, 6))
     column = np.zeros(1, dtype=int)
 
-    def axis(on: tuple[int, ...], rows: int) -> Axis:
-        return Axis(on, True, column, np.zeros((rows, 1), dtype=np.int32), np.zeros((rows, 1), dtype=np.int32))
+    def axis(on: tuple[int, ...], rows: int) -> Along:
+        return Along(on, True, column, np.zeros((rows, 1), dtype=np.int32), np.zeros((rows, 1), dtype=np.int32))
 
     assert repeats.inverse(Windows(grid, (axis((1,), 6), axis((0,), 5))), np.int32) is None
     assert repeats.inverse(Windows(grid, (axis((1,), 6), axis((), 1))), np.int32) is not None
@@ -111,7 +113,7 @@ def test_both_ways_agree_on_positions(n: int, m: int, seed: int, relations: bool
     must = rng.choice(4, size, p=[0.7, 0.1, 0.1, 0.1])
     labels = automata.Labels(must, must | rng.choice(4, size, p=[0.8, 0.1, 0.05, 0.05]))
     safe, found = rng.random(size) < 0.97, []
-    play = automata.Play.of(windows, safe, automaton, labels)
+    play = Play(windows, safe, automaton, *automata.leads_of(automaton, labels))
     for game in (automata.Watched(play) for _ in range(2)):
         assert game.repeats is not None
         if found:

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gapcert import Box, StateSpec
-from gapcert_symbolic.cells.abstraction import Axis, Windows
+from gapcert_cells import Along
+from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.solvers import runs
 
@@ -18,7 +19,7 @@ def drawn(n: int, m: int, seed: int, order: int) -> tuple[Windows, np.ndarray]:
     (−1), or in none (0); and safe cells.
     """
     rng = np.random.default_rng(seed)
-    counts, axes = tuple(int(v) for v in rng.integers(2, {1: 60, 2: 25, 3: 9}[n], n)), list[Axis]()
+    counts, axes = tuple(int(v) for v in rng.integers(2, {1: 60, 2: 25, 3: 9}[n], n)), list[Along]()
     for k, count in enumerate(counts):
         moves = bool(rng.random() < 0.7)
         on = tuple(d for d in range(n) if (d != k and rng.random() < 0.6) or (d == k and not moves))
@@ -27,7 +28,7 @@ def drawn(n: int, m: int, seed: int, order: int) -> tuple[Windows, np.ndarray]:
         last, column = first + rng.integers(0, 3, size), np.arange(m) if k == n - 1 else np.zeros(m, dtype=np.int64)
         if k == n - 1 and order:
             first, last = (np.sort(end, axis=1)[:, ::order] for end in (first, last))
-        axes.append(Axis(on, moves, column, first.astype(np.int32), last.astype(np.int32)))
+        axes.append(Along(on, moves, column, first.astype(np.int32), last.astype(np.int32)))
     grid = Grid(Box(tuple(StateSpec(f"x{k}") for k in range(n)), (0.0,) * n, (1.0,) * n), counts)
     return Windows(grid, tuple(axes)), rng.random(grid.size) < 0.97
 

@@ -20,7 +20,7 @@ from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.kernels import inverse, reach
 from gapcert_symbolic.kernels.kernels import whole
-from gapcert_symbolic.solvers.solvers import Solution
+from gapcert_symbolic.solvers.problem import Play, Solution
 
 from .games import inside, leading, touching
 
@@ -57,26 +57,6 @@ class Labels:
         return letters, number[both]
 
 
-@final
-@dataclass(frozen=True)
-class Play:
-    """leads[q, kind, t]: a cell of that kind may take the automaton from q to t, the last t being nowhere; kind (cells,)."""
-
-    windows: Windows
-    safe: Bools
-    automaton: Automaton
-    leads: Bools
-    kind: Ints
-
-    @classmethod
-    def of(cls, windows: Windows, safe: Bools, automaton: Automaton, labels: Labels) -> Play:
-        return cls(windows, safe, automaton, *leads_of(automaton, labels))
-
-    def entered(self, q: int, won: Any) -> Bools:
-        """(cells,): entered in state q, every reading wins."""
-        return entered(self.leads[q], self.kind, self.safe, won)
-
-
 class Least(Protocol):
     """The least fixpoint of a play: values (states, cells), bits (states, cells, bytes), those of the last one that was asked
     for; `least` has accepting states lead to the positions `assumed`, and tells the largest value.
@@ -96,7 +76,7 @@ def product(
     values and bits have one more axis, the automaton's states; values are the steps until it accepts. by: what solves the
     inner fixpoint, by default the compiled lists.
     """
-    game = (by or Watched)(Play.of(windows, safe, automaton, labels))
+    game = (by or Watched)(Play(windows, safe, automaton, *leads_of(automaton, labels)))
     won = np.broadcast_to(safe, (len(automaton.after), len(safe)))
     rounds = 0
     while True:
@@ -127,14 +107,6 @@ def leads_of(automaton: Automaton, labels: Labels) -> tuple[Bools, Ints]:
         for q in range(states):
             leads[q, k, automaton.table[q, some]] = True
     return leads, kind
-
-
-def entered(leads: Bools, kind: Ints, safe: Bools, won: Bools) -> Bools:
-    """(cells,): entered in the state whose leads these are, every reading wins."""
-    good: Bools = safe & ~leads[:, -1][kind]
-    for t in np.flatnonzero(leads[:, :-1].any(axis=0)):
-        good &= ~leads[:, t][kind] | won[t]
-    return np.asarray(good)
 
 
 def missed(leads: Bools, kind: Ints, safe: Bools) -> npt.NDArray[np.int16]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,59 +12,63 @@ from gapcert import Box, Region
 from gapcert.plugin import Bools, Ints
 from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
-from gapcert_symbolic.kernels import sets
 from gapcert_symbolic.kernels.kernels import Bits
-from gapcert_symbolic.solvers.solvers import Compiled, Fixpoints, Solution
+from gapcert_symbolic.solvers import runs
+from gapcert_symbolic.solvers.problem import Problem, Solution
+from gapcert_symbolic.solvers.solvers import solve
 
 CHUNK = 200_000
-ALONE = Compiled()
 
 
 def leading(windows: Windows, into: Bools, asked: Bools) -> Bits:
     """Per cell that is asked for, all inputs that lead wholly into the cells `into`; packed."""
+    own, after = (np.where(on, 0, -1).astype(np.int32) for on in (asked, into))
     bits = windows.no_bits
-    sets.leading(windows.game, np.where(into, 0, -1).astype(np.int32), asked, bits)
+    runs.leading(windows.game, after, own, bits)
     return bits
 
 
-def remaining(windows: Windows, won: Bools, some: Bools) -> tuple[Bools, Bits]:
+def remaining(problem: Problem, won: Bools, some: Bools) -> tuple[Bools, Bits]:
     """νY. some ∩ Pre(won ∪ Y): of some cells, those from which one can remain among them until one comes to what is won; and
     the inputs that do so.
     """
-    values, bits = np.where(some, 0, np.where(won, 1, -1)).astype(np.int32), windows.no_bits
-    sets.invariance(windows.game, values, bits, np.stack(windows.reach))
-    return values == 0, bits
+    windows, alive = problem.windows(), np.where(some, 0, np.where(won, 1, -1)).astype(np.int32)
+    bits = windows.no_bits
+    runs.invariance(problem.threads, windows.game, alive, bits, *windows.rows)
+    return alive == 0, bits
 
 
-def reach_and_stay(windows: Windows, safe: Bools, target: Bools, by: Fixpoints = ALONE) -> Solution:
+def reach_and_stay(problem: Problem, target: Bools) -> Solution:
     """μX. νY. Pre(X) ∪ (target ∩ Pre(X ∪ Y)), in `safe`: the state is outside the target finitely often.
 
     First the largest part of the target that can be kept for ever, at 0, and the steps to it. Then the cells of the target
     from which one either remains among them or comes to what is won by then: at one lasting value, greater than all so far;
     and the steps to these. So at a lasting value a step leads to no greater one, at others to a smaller one.
     """
-    kept = by.invariance(windows, safe & target)
+    safe = problem.safe
+    kept = solve(replace(problem, safe=safe & target))
     fresh, values, bits, rounds = kept.values >= 0, np.full(len(safe), -1, dtype=np.int32), kept.bits, kept.rounds
     lasting = list[int]()
     while fresh.any():
         level = int(values.max()) + 1
         lasting.append(level)
         values[fresh] = level
-        way = by.reach_avoid(windows, safe, values >= 0)
+        way = solve(replace(problem, target=values >= 0))
         later = way.values > 0
         values[later] = level + way.values[later]
         bits, rounds = np.where(later[:, None], way.bits, bits), rounds + way.rounds
         won = values >= 0
-        fresh, own = remaining(windows, won, safe & target & ~won)
+        fresh, own = remaining(problem, won, safe & target & ~won)
         bits = np.where(fresh[:, None], own, bits)
     return Solution(values, bits, rounds, tuple(lasting) or (0,))
 
 
-def recurrence(windows: Windows, safe: Bools, target: Bools, by: Fixpoints = ALONE) -> Solution:
+def recurrence(problem: Problem, target: Bools) -> Solution:
     """νZ μX. (target ∩ Pre(Z)) ∪ Pre(X): steps to the next visit, and in the target the inputs from which another follows."""
-    visits, rounds = safe & target, 0
+    windows, safe, rounds = problem.windows(), problem.safe, 0
+    visits = safe & target
     while True:
-        way = by.reach_avoid(windows, safe, visits)
+        way = solve(replace(problem, safe=safe, target=visits))
         safe, rounds = way.values >= 0, rounds + way.rounds
         again = leading(windows, safe, visits)
         left = visits & again.any(axis=1)

@@ -18,9 +18,9 @@ from gapcert.plugin import Automaton, Bools, Ints
 from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.kernels import reach, sets
-from gapcert_symbolic.solvers.solvers import Solution
+from gapcert_symbolic.solvers.problem import Solution, entered
 
-from .automata import Labels, entered, leads_of, missed, started
+from .automata import Labels, leads_of, missed, started
 from .games import inside, touching
 from .refinement import Level, Refined, Tree
 

@@ -16,12 +16,12 @@ import numpy as np
 
 from gapcert import Goal, UsageError
 from gapcert.plugin import Bools, Ints
-from gapcert_cells import Along, Splits, Successors, SuccessorsByLevel
-from gapcert_symbolic.cells.abstraction import BYTES, MEMORY, Axis, Windows
+from gapcert_cells import Splits, SuccessorsByLevel
+from gapcert_symbolic.cells.abstraction import BYTES, MEMORY, Windows
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.kernels import reach, sets
 from gapcert_symbolic.kernels.kernels import Game
-from gapcert_symbolic.solvers.solvers import Solution
+from gapcert_symbolic.solvers.problem import Solution
 
 from .automata import Labels
 from .games import inside, touching
@@ -42,13 +42,7 @@ class Refined(NamedTuple):
     wins: Bools | None = None
 
     def promised(self) -> SuccessorsByLevel | None:
-        made = tuple(
-            Successors(
-                w.grid.counts, w.grid.wraps, tuple(Along(a.on, a.moves, a.column, a.first, a.last, a.row) for a in w.axes)
-            )
-            for w in self.windows
-        )
-        return SuccessorsByLevel(self.splits, made).unless_large()
+        return SuccessorsByLevel(self.splits, tuple(w.successors for w in self.windows)).unless_large()
 
     def won(self, least: int = 0) -> int:
         """Cells of at least this value."""
@@ -76,21 +70,16 @@ class Tree:
         self.values, self.bits, self.lasting = coarse.values.astype(np.int32), coarse.bits, list(coarse.lasting)
 
     def game(self, windows: Windows) -> Game:
-        nodes = {"children": self.first, "start": self.start, "flat": self.flat, "size": len(self.flat)}
-        return windows.game._replace(level=self.level, roots=np.array(self.roots), **nodes)
-
-    def _rows(self, axis: Axis) -> Ints:
-        """The row of the axis for each node of the last level."""
-        if axis.row is not None:
-            return axis.row
-        index, counts = np.unravel_index(self.flat, self.grid.counts), [self.grid.counts[d] for d in axis.on]
-        return np.asarray(np.ravel_multi_index([index[d] for d in axis.on], counts) if axis.on else 0 * self.flat)
+        return windows.game._replace(
+            size=len(self.flat), level=self.level, children=self.first, start=self.start, flat=self.flat
+        )
 
     def near(self, windows: Windows) -> Ints:
         """(2, axes): least first and largest last cell of the windows of the last level's nodes, counted from the own index."""
         index, out = np.unravel_index(self.flat, self.grid.counts), []
         for k, axis in enumerate(windows.axes):
-            row, own = self._rows(axis), 0 if axis.moves else index[k]
+            row = axis.rows(index, self.grid.counts, np.arange(len(self.flat)))
+            own = 0 if axis.moves else index[k]
             least, most = axis.first.min(axis=1)[row] - own, axis.last.max(axis=1)[row] - own
             out.append([least.min(), most.max()])
         return np.array(out, dtype=np.int64).T.copy()

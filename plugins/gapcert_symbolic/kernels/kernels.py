@@ -44,9 +44,9 @@ class Game(NamedTuple):
     """The cells in play, so many (`size`), of a grid with so many along each axis; strides are in cells. allowed (cells,
     inputs): empty where all are.
 
-    On a grid some cells of which are halved (`gapcert.Splits`) they are those of the last level, number `level`; roots: cells
-    per axis of level 0; children: the first child of each node, or 0. They are the nodes start, start + 1, … with the numbers
-    `flat` on their own grid. Level 0 is a grid as it is, and needs neither children nor flat.
+    On a grid some cells of which are halved (`gapcert_cells.Splits`) they are those of the last level, number `level`: the
+    nodes start, start + 1, … with the numbers `flat` on their own grid. children: the first child of each node, or 0. Level 0
+    is a grid as it is, and needs neither.
     """
 
     counts: Ints
@@ -56,7 +56,6 @@ class Game(NamedTuple):
     allowed: Bools
     size: int
     level: int
-    roots: Ints
     children: Ints
     start: int
     flat: Ints
@@ -184,7 +183,7 @@ def _node(game: Any, c: Ints) -> tuple[int, int]:
     at, shift, counts = 0, game.level, game.counts
     for k in range(len(c)):
         i = c[k] if c[k] < counts[k] else c[k] - counts[k]
-        at = at * game.roots[k] + (i >> shift)
+        at = at * (counts[k] >> game.level) + (i >> shift)
     while shift and game.children[at]:
         shift -= 1
         child = 0
@@ -196,11 +195,11 @@ def _node(game: Any, c: Ints) -> tuple[int, int]:
 
 
 @inlined
-def _row(game: Any, c: Ints) -> int:
+def _row(counts: Ints, strides: Ints, c: Ints) -> int:
     """The first cell of the row of the last axis that c is in."""
     row = 0
     for k in range(len(c) - 1):
-        row += (c[k] if c[k] < game.counts[k] else c[k] - game.counts[k]) * game.strides[k]
+        row += (c[k] if c[k] < counts[k] else c[k] - counts[k]) * strides[k]
     return row
 
 
@@ -222,7 +221,7 @@ def _outside(game: Any, values: Values, level: int, work: Any) -> int:
                 return q
             _skip(c, above)
         else:
-            row, count = _row(game, c), game.counts[n]
+            row, count = _row(game.counts, game.strides, c), game.counts[n]
             for z in range(c[n], b[n] + 1):
                 q = row + (z if z < count else z - count)
                 if values[q] < 0 or values[q] >= level:

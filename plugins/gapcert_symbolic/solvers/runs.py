@@ -29,6 +29,8 @@ from gapcert_symbolic.kernels.kernels import (
     together,
 )
 
+from .problem import Problem, Solution
+
 Runs = npt.NDArray[np.int32]
 MOST = 4  # threads: each takes four bytes per cell
 BLOCK = 1 << 12  # rows whose differences are taken at once: chosen for memory, not measured
@@ -36,8 +38,8 @@ ROOM = 36  # rows of what each thread counts in, of which four are used: the res
 
 
 class Rows(NamedTuple):
-    """alive (cells,): 0, or −1. Rows of the first axis: least and most, the first and last that a window of one touches; stale,
-    those to be looked at again, and fresh, those where a cell died.
+    """alive (cells,): as in `invariance`. Rows of the first axis: least and most, the first and last that a window of one
+    touches; stale, those to be looked at again, and fresh, those where a cell died.
     """
 
     alive: Values
@@ -48,12 +50,12 @@ class Rows(NamedTuple):
 
 
 class Own(NamedTuple):
-    """What a thread has: a run per cell; room for an index, and for the ends of a window and a cell of it (3, axes); and for
-    what rows of windows have in common (2, cells of the last axis).
+    """What a thread has: a run per cell; room for the indices of a cell, and for the ends of a window and a cell of it (3,
+    axes); and for what rows of windows have in common (2, cells of the last axis).
     """
 
     run: Runs
-    index: Ints
+    cell: Ints
     ends: Ints
     known: Ints
 
@@ -63,7 +65,7 @@ def _count(alive: Values, n: int, run: Runs) -> None:
     for row in range(0, len(alive), n):
         length = 0
         for i in range(row + n - 1, row - 1, -1):
-            length = length + 1 if alive[i] == 0 else 0
+            length = length + 1 if alive[i] >= 0 else 0
             run[i] = length
 
 
@@ -84,7 +86,7 @@ def _shortest(game: Any, own: Any, z: int, enough: int) -> int:
         c[k] = a[k]
     least, more = game.counts[n], True
     while more and least >= enough:
-        least = min(least, own.run[_row(game, c) + z])
+        least = min(least, own.run[_row(game.counts, game.strides, c) + z])
         more = _on(a, b, c, n)
     return int(least)
 
@@ -93,7 +95,7 @@ def _shortest(game: Any, own: Any, z: int, enough: int) -> int:
 def _holds(game: Any, own: Any, i: int, j: int) -> bool:
     """Is the window of an input inside the grid and alive?"""
     n, ends = len(game.counts) - 1, own.ends
-    inside = _ends(game, i, own.index, j, n + 1, ends[0], ends[1])
+    inside = _ends(game, i, own.cell, j, n + 1, ends[0], ends[1])
     z, last = ends[0, n], ends[1, n]
     length, beyond = min(last, game.counts[n] - 1) - z + 1, last - game.counts[n] + 1
     return inside and _shortest(game, own, z, length) >= length and (beyond <= 0 or _shortest(game, own, 0, beyond) >= beyond)
@@ -147,7 +149,7 @@ def _in_order(game: Any, own: Any, sense: int, i: int, bits: Bits) -> bool:
 
     The windows within one run of the last axis that is alive in all rows are those of consecutive inputs.
     """
-    first, last, column, index, found = game.packed.first, game.packed.last, game.packed.column, own.index, False
+    first, last, column, index, found = game.packed.first, game.packed.last, game.packed.column, own.cell, False
     n, m = len(game.counts) - 1, column.shape[1]
     inside = _ends(game, i, index, 0, n, own.ends[0], own.ends[1])
     base, at, top = _entry(game.packed, i, index, n), index[n] if game.packed.moves[n] else 0, m - 1
@@ -205,8 +207,8 @@ def _learn(game: Any, rows: Any, runs: Runs, own: int) -> None:
 @inlined
 def _first(game: Any, own: Any, row: int) -> None:
     """The index of the first cell of a row of the first axis."""
-    own.index[:] = 0
-    own.index[0] = row
+    own.cell[:] = 0
+    own.cell[0] = row
 
 
 @borrowing
@@ -216,7 +218,7 @@ def _valid_in_order(game: Any, alive: Values, own: Any, sense: int, bits: Bits, 
     for i in range(begin * game.strides[0], stop * game.strides[0]):
         if alive[i] == 0:
             _in_order(game, own, sense, i, bits)
-        _next(game.counts, own.index)
+        _next(game.counts, own.cell)
 
 
 @borrowing
@@ -227,7 +229,7 @@ def _valid(game: Any, alive: Values, own: Any, changes: Bools, bits: Bits, begin
     from the one before along another axis, too.
     """
     first, last, column, n = game.packed.first, game.packed.last, game.packed.column, len(game.counts) - 1
-    index, least, stamps, stamp = own.index, own.known[0], own.known[1], 0
+    index, least, stamps, stamp = own.cell, own.known[0], own.known[1], 0
     size, whole = game.counts[n], game.wraps[n]
     _first(game, own, begin)
     for i in range(begin * game.strides[0], stop * game.strides[0]):
@@ -274,45 +276,70 @@ def _sweep(game: Any, rows: Any, own: Any, begin: int, end: int, forth: bool, se
                     if not kept:
                         alive[i], rows.fresh[row] = -1, True
                         _die(i // width * width, i, own.run)
-                _next(game.counts, own.index)
+                _next(game.counts, own.cell)
             if rows.fresh[row]:
                 _mark(game.wraps[0], rows, row, begin, end)
 
 
+def _shared(game: Game, cells: int, threads: int) -> tuple[int, Any, list[Own], list[tuple[int, int]]]:
+    """`_sense`, or 0 where relations decide; the runs of all threads; and what each thread has, and its rows."""
+    sense, counts = 0 if game.allowed.size else _sense(game), game.counts
+    # With one axis a run passes from one thread's cells into another's.
+    parts = 1 if len(counts) == 1 else min(threads, MOST, int(counts[0]))
+    runs, rooms = np.empty((parts, cells), np.int32), np.zeros((parts, ROOM, len(counts)), np.int64)
+    known = np.zeros((parts, 2, 0 if sense else counts[-1]), np.int64)
+    own = [Own(runs[p], rooms[p, 0], rooms[p, 1:4], known[p]) for p in range(parts)]
+    return sense, runs, own, [part(int(counts[0]), parts, p) for p in range(parts)]
+
+
+def _kept(game: Game, asked: Values, own: Own, sense: int, bits: Bits, rows: tuple[int, int]) -> None:
+    """All inputs whose windows are alive, of the cells asked for, which have 0."""
+    if sense:
+        _valid_in_order(game, asked, own, sense, bits, *rows)
+    else:
+        column = game.packed.column
+        changes = np.append(True, (column[:-1, 1:] != column[:-1, :-1]).any(axis=0))
+        _valid(game, asked, own, changes, bits, *rows)
+
+
+def leading(game: Game, into: Values, asked: Values, bits: Bits) -> None:
+    """Fills bits of the cells asked for, which have 0, with all inputs that lead wholly into cells that have 0."""
+    sense, _, (own,), (rows,) = _shared(game, len(into), 1)
+    _count(into, game.counts[-1], own.run)
+    _kept(game, asked, own, sense, bits, rows)
+
+
+def solve(problem: Problem) -> Solution | None:
+    """Invariance, whatever the windows."""
+    if problem.target is not None:
+        return None
+    windows, values = problem.windows(), np.where(problem.safe, 0, -1).astype(np.int32)
+    bits = windows.no_bits
+    return Solution(values, bits, invariance(problem.threads, windows.game, values, bits, *windows.rows))
+
+
 def invariance(threads: int, game: Game, alive: Values, bits: Bits, least: Ints, most: Ints) -> int:
-    """alive: 0 for safe cells, −1 for others; changed to the greatest set that can be kept, and bits filled. Returns sweeps.
+    """alive: 0 for safe cells, more for those that need no input, −1 for others; changed to the greatest set that can be kept,
+    and bits filled of those with 0. Returns sweeps.
 
     A cell stays while the input remembered for it stays valid. A sweep looks at the rows of the first axis from which a window
     reaches one where a cell has died since they were looked at; least, most: the first and last that any window of a row does.
     Each thread has rows and runs of its own, and learns after a sweep what died in the others' rows: so nothing is written that
     another reads, and the number of sweeps depends on how many threads there are, but on nothing else.
     """
-    sense, counts, column = 0 if game.allowed.size else _sense(game), game.counts, game.packed.column
-    # With one axis a run passes from one thread's cells into another's.
-    parts = 1 if len(counts) == 1 else min(threads, MOST, int(counts[0]))
-    ranges = [part(int(counts[0]), parts, p) for p in range(parts)]
-    runs, rooms = np.empty((parts, len(alive)), np.int32), np.zeros((parts, ROOM, len(counts)), np.int64)
-    known = np.zeros((parts, 2, 0 if sense else counts[-1]), np.int64)
-    own = [Own(runs[p], rooms[p, 0], rooms[p, 1:4], known[p]) for p in range(parts)]
-    rows = Rows(alive, least, most, np.ones(counts[0], np.bool_), np.zeros(counts[0], np.bool_))
+    sense, runs, own, ranges = _shared(game, len(alive), threads)
+    rows = Rows(alive, least, most, np.ones(game.counts[0], np.bool_), np.zeros(game.counts[0], np.bool_))
     witness, sweeps = None if sense else np.full(len(alive), -1, np.int32), 0
-    changes = np.append(True, (column[:-1, 1:] != column[:-1, :-1]).any(axis=0))
 
     def sweep(p: int) -> None:
         _sweep(game, rows, own[p], *ranges[p], sweeps % 2 == 1, sense or None, witness, bits[:0])
 
-    def valid(p: int) -> None:
-        if sense:
-            _valid_in_order(game, alive, own[p], sense, bits, *ranges[p])
-        else:
-            _valid(game, alive, own[p], changes, bits, *ranges[p])
-
-    with together(parts) as each:
-        each(lambda p: _count(alive, counts[-1], runs[p]))
+    with together(len(own)) as each:
+        each(lambda p: _count(alive, game.counts[-1], runs[p]))
         while rows.stale.any():
             sweeps += 1
             each(sweep)
-            if parts > 1:
+            if len(own) > 1:
                 each(lambda p: _learn(game, rows, runs, p))
-        each(valid)
+        each(lambda p: _kept(game, alive, own[p], sense, bits, ranges[p]))
     return sweeps
