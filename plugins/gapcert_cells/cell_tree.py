@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from gapcert.plugin import Array, Bools, Ints
 
-from .successors import Successors
+from .successors import Successors, corners
 
 
 @final
@@ -126,14 +126,7 @@ class SuccessorsByLevel:
 
     def corners(self, cell: Ints, which: Ints) -> Ints:
         """(n, 2^axes): places at the corners of the box of each pair, those outside the grid moved to its edge."""
-        ends = np.stack(self.ends(cell, which))
-        for j, (n, wraps) in enumerate(zip(self.splits.finest, self.levels[0].wraps, strict=True)):
-            ends[:, :, j] = ends[:, :, j] % n if wraps else np.clip(ends[:, :, j], 0, n - 1)
-        found = [
-            np.ravel_multi_index([ends[s, :, j] for j, s in enumerate(side)], self.splits.finest)
-            for side in self.splits.sides.tolist()
-        ]
-        return np.stack(found, axis=1)
+        return corners(*self.ends(cell, which), self.splits.finest, self.levels[0].wraps)
 
     def _by_level(self, cell: Ints) -> list[tuple[int, Ints, Ints, Ints]]:
         """Of each level that occurs the rows, the flat cells on its grid, and their numbers among its nodes."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any, ClassVar, final
@@ -29,6 +29,12 @@ class Along:
     last: npt.NDArray[Any]
     row: npt.NDArray[Any] | None = None
 
+    def rows(self, index: Sequence[Ints], counts: tuple[int, ...], number: Ints | None = None) -> Any:
+        """(n,), or 0: the rows of cells with these indices; number (n,): which of the cells with a `row` they are."""
+        if self.row is not None and number is not None:
+            return self.row[number]
+        return np.ravel_multi_index([index[d] for d in self.on], [counts[d] for d in self.on]) if self.on else 0
+
 
 @final
 @dataclass(frozen=True, eq=False)
@@ -53,11 +59,7 @@ class Successors:
         index = np.unravel_index(cell, self.counts)
         ends = np.empty((2, len(cell), len(self.axes)), dtype=np.int64)
         for k, axis in enumerate(self.axes):
-            on = axis.on
-            if axis.row is not None and number is not None:
-                row: Any = axis.row[number]
-            else:
-                row = np.ravel_multi_index([index[d] for d in on], [self.counts[d] for d in on]) if on else 0
+            row = axis.rows(index, self.counts, number)
             for end, table in zip(ends, (axis.first, axis.last), strict=True):
                 end[:, k] = (index[k] if axis.moves else 0) + table[row, axis.column[which]].astype(np.int64)
         return ends[0], ends[1]
@@ -75,14 +77,7 @@ class Successors:
 
     def corners(self, cell: Ints, which: Ints) -> Ints:
         """(n, 2^axes): flat cells at the corners of the box of each pair, those outside the grid moved to its edge."""
-        ends = np.stack(self.ends(cell, which))
-        for k, (n, wraps) in enumerate(zip(self.counts, self.wraps, strict=True)):
-            ends[:, :, k] = ends[:, :, k] % n if wraps else np.clip(ends[:, :, k], 0, n - 1)
-        found = [
-            np.ravel_multi_index([ends[side, :, k] for k, side in enumerate(sides)], self.counts)
-            for sides in product((0, 1), repeat=len(self.counts))
-        ]
-        return np.stack(found, axis=1)
+        return corners(*self.ends(cell, which), self.counts, self.wraps)
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """As few bytes as the numbers allow; `from_arrays` is its inverse."""
@@ -113,6 +108,15 @@ def _narrow(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     low, high = (int(values.min()), int(values.max())) if values.size else (0, 0)
     kind = np.result_type(np.min_scalar_type(low), np.min_scalar_type(high))
     return values.astype(kind if np.issubdtype(kind, np.integer) else np.int64)
+
+
+def corners(first: Ints, last: Ints, counts: tuple[int, ...], wraps: tuple[bool, ...]) -> Ints:
+    """(n, 2^axes): flat cells at the corners of boxes, from first to last (n, axes); those outside moved to the grid's edge."""
+    ends = np.stack([first, last])
+    for k, (n, round_) in enumerate(zip(counts, wraps, strict=True)):
+        ends[:, :, k] = ends[:, :, k] % n if round_ else np.clip(ends[:, :, k], 0, n - 1)
+    sides = product((0, 1), repeat=len(counts))
+    return np.stack([np.ravel_multi_index([ends[s, :, k] for k, s in enumerate(side)], counts) for side in sides], axis=1)
 
 
 def depths(winning: Bools, wraps: tuple[bool, ...]) -> npt.NDArray[np.int32]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from gapcert import Array
 
-from .training import Layers, Plan, Training
+from .training import Layers, Plan, Progress, Training
 
 Index = npt.NDArray[np.intp]
 
@@ -52,7 +52,7 @@ class BandTraining(Training):
     much q, with its shift, lies beyond t on average. The largest is softened, less so as the training goes on.
     """
 
-    def __init__(self, plan: Plan, pool: Pool, checkpoint: Path | None, progress: Callable[[int, int, float], None]) -> None:
+    def __init__(self, plan: Plan, pool: Pool, checkpoint: Path | None, progress: Progress) -> None:
         super().__init__(plan, checkpoint, progress)
         self.pool = pool
         sizes = (pool.z.shape[1], *plan.hidden, pool.t.shape[1])

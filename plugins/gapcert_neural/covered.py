@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
@@ -12,7 +12,7 @@ import numpy as np
 
 from gapcert import Array, UsageError
 
-from .training import Layers, Plan, Training
+from .training import Layers, Plan, Progress, Training
 
 _BATCH, _SCORED = 4096, 100_000
 _TURNS = 2  # of the fixed point for X, in each step
@@ -42,7 +42,7 @@ class CoverTraining(Training):
         plan: Plan,
         points: Covered,
         checkpoint: Path | None,
-        progress: Callable[[int, int, float], None],
+        progress: Progress,
         shapes: Sequence[tuple[int, ...]] | None = None,
     ) -> None:
         super().__init__(plan, checkpoint, progress)
@@ -126,9 +126,7 @@ class CertifiedTraining(PaidTraining):
     X follows the training by a fixed point, and the gradient at a fixed X is that of the maximum.
     """
 
-    def __init__(
-        self, plan: Plan, points: Covered, checkpoint: Path | None, progress: Callable[[int, int, float], None]
-    ) -> None:
+    def __init__(self, plan: Plan, points: Covered, checkpoint: Path | None, progress: Progress) -> None:
         super().__init__(plan, points, checkpoint, progress)
         nz = points.z.shape[1]
         self.extra = np.tile(np.eye(nz) / nz, (points.t.shape[1], 1, 1))
@@ -169,7 +167,7 @@ class PaperTraining(CoverTraining):
         plan: Plan,
         points: Covered,
         checkpoint: Path | None,
-        progress: Callable[[int, int, float], None],
+        progress: Progress,
         constants: Array,
         barrier: float,
     ) -> None:

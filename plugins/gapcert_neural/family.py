@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, final
@@ -17,7 +17,7 @@ from gapcert_networks import Network, raised
 from .banded import BandTraining, Pool
 from .covered import CertifiedTraining, Covered, CoverTraining, PaperTraining
 from .shapes import SHAPES
-from .training import Plan
+from .training import Plan, Progress
 
 _PER_CELL, _MOST = 16, 65_536  # points that the band is asked at
 _TABLE = 4096  # cells of the default table
@@ -132,7 +132,7 @@ class Neural(GapFamily):
         return units, Pool.sorted(units.inputs(z), units.outputs(targets), signs, table.locate(z))
 
 
-def _followed(problem: GapProblem) -> tuple[Path | None, Callable[[int, int, float], None]]:
+def _followed(problem: GapProblem) -> tuple[Path | None, Progress]:
     """Where a training leaves its checkpoints, and whom it tells how far it is."""
 
     pulse = Pulse(problem.emit, "training", unit="steps")

@@ -16,7 +16,7 @@ import numpy as np
 from gapcert import Array
 
 from .covered import Covered, PaidTraining
-from .training import Layers, Plan
+from .training import Layers, Plan, Progress
 
 _ROOT2 = math.sqrt(2.0)
 
@@ -24,9 +24,7 @@ _ROOT2 = math.sqrt(2.0)
 class ShapedTraining(PaidTraining):
     """The constant c = exp(θ_0) of all outputs is one of the parameters."""
 
-    def __init__(
-        self, plan: Plan, points: Covered, checkpoint: Path | None, progress: Callable[[int, int, float], None]
-    ) -> None:
+    def __init__(self, plan: Plan, points: Covered, checkpoint: Path | None, progress: Progress) -> None:
         super().__init__(plan, points, checkpoint, progress, self.sizes(plan, points))
         self.half = self.tensor(points.half)
 

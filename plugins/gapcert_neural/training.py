@@ -20,6 +20,8 @@ import gapcert
 from gapcert import Array, UsageError
 
 Layers = list[tuple[Array, Array]]
+Progress = Callable[[int, int, float], None]
+"""Told the steps done, of how many, and the best loss so far."""
 
 _EVERY = 5.0  # seconds between checkpoints
 _LOOKS = 20  # at the loss of all points, in the course of a training
@@ -53,7 +55,7 @@ class Training(ABC):
 
     shapes: Sequence[tuple[int, ...]]
 
-    def __init__(self, plan: Plan, checkpoint: Path | None, progress: Callable[[int, int, float], None]) -> None:
+    def __init__(self, plan: Plan, checkpoint: Path | None, progress: Progress) -> None:
         self.plan, self.checkpoint, self.progress = plan, checkpoint, progress
         self.torch: Any = importlib.import_module("torch")
         self.step, self.best, self.stale = 0, np.inf, 0

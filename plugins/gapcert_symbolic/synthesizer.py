@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from typing import Any, Literal, NamedTuple, final
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from gapcert import Array, Box, Domain, GapFunction, Goal, Model, Region, SynthesisProblem, UsageError
 from gapcert.plugin import Bools, Ints, Policy, Pulse, Synthesizer, magnitude
-from gapcert_cells import Along, AutomatonController, GridController, Successors
+from gapcert_cells import AutomatonController, GridController, Successors
 
 from .cells.abstraction import Windows, check_size, windows
 from .cells.bounds import Bound, Enclosed, Grown
@@ -25,8 +26,9 @@ from .games.games import inside, over, reach_and_stay, recurrence, touching
 from .games.reason import Cause, why_empty
 from .games.refined_automata import refined_product
 from .games.refinement import Refined, refined
-from .solvers import affine, dense, lazy
-from .solvers.solvers import Compiled, Fixpoints, Solution, usable
+from .solvers import dense
+from .solvers.problem import Dynamics, Problem, Solution
+from .solvers.solvers import solve, usable
 
 CHUNK = 1 << 20
 TRUSTED = "The successors of cells are bounded by the growth bound that is declared, in floating point; nothing proves it."
@@ -205,13 +207,11 @@ class Symbolic(Synthesizer):
         def windows_on(grid: Grid, cell: Ints) -> Windows:
             added = None if problem.gap is None else disturbance(problem.gap, grid, plan.axes, tick=tick("gap over cells"))
             bound = self._bound(problem.model, grid)
-            return windows(bound, grid, plan.axes, added, tick=tick("successors of cells"), cell=cell)
-
-        def offer(grid: Grid, cell: Ints) -> Bools | None:
-            return offered(problem.domain, grid, plan.axes, cell)
+            allowed = offered(problem.domain, grid, plan.axes, cell)
+            return windows(bound, grid, plan.axes, added, allowed=allowed, tick=tick("successors of cells"), cell=cell)
 
         by = refined if problem.goal.automaton is None else refined_product
-        return by(problem.goal, self.refine, made.solution, made.paths(), windows_on, offer)
+        return by(problem.goal, self.refine, made.solution, made.paths(), windows_on)
 
     def _made(self, problem: SynthesisProblem, plan: _Plan, added: Disturbance | None, tick: Any = None) -> _Made:
         """The fixpoint on a plan, with [l, u] over its cells."""
@@ -225,13 +225,13 @@ class Symbolic(Synthesizer):
         labels = Labels.of(grid, goal.regions) if goal.automaton else None
         target = np.zeros(grid.size, dtype=bool) if goal.target is None else inside(grid, goal.target)
         inputs = math.prod(len(a) for a in plan.axes)
-        by: Fixpoints = dense if self.solver == "jax" else Compiled(usable(self.threads, grid.size * inputs))
-        lean = goal.kind == "invariance" and self.solver == "compiled"
-        # What the closed form is given it may take for its own.
-        found = _direct(bound, plan, added, allowed, _safe(grid, goal)) if lean else None
-        solution = _solve(goal, paths(), safe(), target, labels, by) if found is None else found
+        dynamics = Dynamics(bound, grid, axes, added, allowed) if goal.kind == "invariance" else None
+        # What a solver without tables is given it may take for its own.
+        own = safe() if dynamics is None else _safe(grid, goal)
+        asked = Problem(paths, own, None, dynamics, self.solver, usable(self.threads, grid.size * inputs))
+        solution = _solve(goal, asked, target, labels)
         Pulse(problem.emit, "controller", 1, part="fixpoint")(1, solution.told)
-        return _Made(goal, grid, inputs, paths, safe, target, labels, solution, found is None)
+        return _Made(goal, grid, inputs, paths, safe, target, labels, solution, paths.cache_info().currsize > 0)
 
     def _reason(self, problem: SynthesisProblem, plan: _Plan, added: Disturbance | None, made: _Made) -> dict[str, Any]:
         """Why nothing wins, and what would have to change."""
@@ -275,8 +275,7 @@ class _Made(NamedTuple):
         return self._tables if most <= Successors.KEPT else None
 
     def _tables(self) -> Successors | None:
-        along = tuple(Along(a.on, a.moves, a.column, a.first, a.last) for a in self.paths().axes)
-        return Successors(self.grid.counts, self.grid.wraps, along).unless_large()
+        return self.paths().successors.unless_large()
 
     def winning(self, least: int = 0) -> int:
         """Cells of at least this value, with the memory that a run begins with there."""
@@ -313,14 +312,6 @@ def _safe(grid: Grid, goal: Goal) -> Bools:
     return safe
 
 
-def _direct(bound: Bound, plan: _Plan, added: Disturbance | None, allowed: Bools | None, safe: Bools) -> Solution | None:
-    """Invariance where tables would be large, without them."""
-    grid, axes = plan.grid, plan.axes
-    if (closed := affine.maps(bound, grid, axes, added, allowed)) is not None:
-        return Solution(*affine.invariance(closed, grid, safe), 1)
-    return lazy.solved(bound, grid, axes, added, allowed, safe)
-
-
 def _asked(goal: Goal) -> list[tuple[str, Region]]:
     """The regions that cells must be told to lie in, with their names."""
     names = goal.automaton.propositions if goal.automaton else ()
@@ -328,14 +319,13 @@ def _asked(goal: Goal) -> list[tuple[str, Region]]:
     return [*target, *((f"region {name}", region) for name, region in zip(names, goal.regions, strict=True))]
 
 
-def _solve(goal: Goal, paths: Windows, safe: Bools, target: Bools, labels: Labels | None, by: Fixpoints) -> Solution:
+def _solve(goal: Goal, problem: Problem, target: Bools, labels: Labels | None) -> Solution:
     if goal.automaton is not None and labels is not None:
-        return product(paths, safe, goal.automaton, labels, dense.Positions if by is dense else None)
-    if goal.kind == "invariance":
-        return by.invariance(paths, safe)
-    if goal.kind == "reach_avoid":
-        return by.reach_avoid(paths, safe, target)
-    return {"reach_and_stay": reach_and_stay, "recurrence": recurrence}[goal.kind](paths, safe, target, by)
+        by = dense.Positions if problem.solver == "jax" else None
+        return product(problem.windows(), problem.safe, goal.automaton, labels, by)
+    if goal.kind in ("invariance", "reach_avoid"):
+        return solve(problem if goal.kind == "invariance" else replace(problem, target=target))
+    return {"reach_and_stay": reach_and_stay, "recurrence": recurrence}[goal.kind](problem, target)
 
 
 def _grid(goal: Goal, on: tuple[int, ...], held: Box | None, counts: tuple[int, ...]) -> Grid:

@@ -19,6 +19,9 @@ WRITTEN = Path(__file__).parents[1] / "identity"
 PACKAGES = ("gapcert", *sorted(p.name for p in (WRITTEN.parents[1] / "plugins").iterdir() if (p / "__init__.py").exists()))
 GONE = {
     "gapcert_symbolic.kernels:Threaded": "the threads of Numba are set where kernels are compiled",
+    "gapcert_symbolic.abstraction:Axis": "what a step may touch along an axis is gapcert_cells:Along, whether promised or not",
+    "gapcert_symbolic.solvers:Compiled": "which solver answers a problem is for the order of SOLVERS to say",
+    "gapcert_symbolic.solvers:Fixpoints": "as above",
     "gapcert.diagnosis.asked:Answer": "what a study found is an Outcome, whatever the study",
     "gapcert.events:Stages": "a protocol that only gapcert.run:_Stages had",
     "gapcert.testing.hidden.": "the generator of hidden effects is no part of the package any more",

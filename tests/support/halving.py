@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from gapcert import Box, StateSpec
-from gapcert_symbolic.cells.abstraction import Axis, Windows
+from gapcert_cells import Along
+from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
 
 TURN = 2 * np.pi
@@ -25,7 +26,7 @@ def nested(n: int, m: int, levels: int, rng: np.random.Generator) -> list[Window
             c, wraps = grid.counts[k], grid.wraps[k]
             a, b = (first[k], last[k]) if wraps else (np.clip(first[k], -1, c), np.clip(last[k], -1, c))
             a, b = (a % c, a % c + np.minimum(b - a, c - 1)) if wraps else (a, b)
-            tables.append(Axis(tuple(range(n)), False, np.arange(m), a.astype(np.int32), b.astype(np.int32)))
+            tables.append(Along(tuple(range(n)), False, np.arange(m), a.astype(np.int32), b.astype(np.int32)))
         made.append(Windows(grid, tuple(tables)))
         if level < levels:
             grid = grid.halved

@@ -26,7 +26,7 @@ from gapcert_symbolic.games import games, refined_automata
 from gapcert_symbolic.games.automata import Labels, leads_of, product, started
 from gapcert_symbolic.games.refined_automata import refined_product
 from gapcert_symbolic.games.refinement import Refined
-from gapcert_symbolic.solvers.solvers import Solution
+from gapcert_symbolic.solvers.problem import Solution
 from gapcert_symbolic.synthesizer import Symbolic
 
 AUTOMATA = [*map(automaton_of, ("F (a & F b)", "F a & F b", "!a U b", "F (a & X b)")), read_hoa(AGAIN)]
@@ -55,7 +55,7 @@ def drawn(rng: np.random.Generator) -> tuple[list[Windows], Goal, Refined, np.nd
     made = nested(int(rng.integers(1, 3)), int(rng.integers(1, 4)), levels, rng)
     goal, by_grid = goal_of(made[0].grid.box, automaton, rng), {w.grid.counts: w for w in made}
     coarse = solved(made[0], goal)[0]
-    found = refined_product(goal, levels, coarse, made[0], lambda grid, _: by_grid[grid.counts], lambda grid, _: None)
+    found = refined_product(goal, levels, coarse, made[0], lambda grid, _: by_grid[grid.counts])
     return made, goal, found, replace(found.splits, levels=levels).painted()
 
 

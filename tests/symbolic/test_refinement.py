@@ -25,7 +25,8 @@ from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.games import games, refinement
 from gapcert_symbolic.games.refinement import Refined, refined
-from gapcert_symbolic.solvers import solvers
+from gapcert_symbolic.solvers.problem import Problem, Solution
+from gapcert_symbolic.solvers.solvers import solve
 from gapcert_symbolic.synthesizer import Symbolic
 
 GOALS = ("invariance", "reach_avoid", "reach_and_stay", "recurrence")
@@ -48,22 +49,22 @@ def masks(grid: Grid, goal: Goal) -> tuple[np.ndarray, np.ndarray]:
     return safe, np.zeros(grid.size, dtype=bool) if goal.target is None else games.inside(grid, goal.target)
 
 
-def solved(windows: Windows, goal: Goal) -> solvers.Solution:
+def solved(windows: Windows, goal: Goal) -> Solution:
     safe, target = masks(windows.grid, goal)
-    if goal.target is None:
-        return solvers.invariance(windows, safe)
-    by_kind = {"reach_avoid": solvers.reach_avoid, "reach_and_stay": games.reach_and_stay, "recurrence": games.recurrence}
-    return by_kind[goal.kind](windows, safe, target)
+    problem = Problem(lambda: windows, safe)
+    if goal.kind in ("invariance", "reach_avoid"):
+        return solve(problem if goal.target is None else replace(problem, target=target))
+    return {"reach_and_stay": games.reach_and_stay, "recurrence": games.recurrence}[goal.kind](problem, target)
 
 
 def on_levels(made: list[Windows], goal: Goal, allowed: np.ndarray | None = None) -> Refined:
     """allowed: inputs by number that the cells of further levels may use."""
     by_grid = {w.grid.counts: w for w in made}
 
-    def offer(grid: Grid, cell: np.ndarray) -> np.ndarray | None:
-        return None if allowed is None else np.tile(allowed, (len(cell), 1))
+    def finer(grid: Grid, cell: np.ndarray) -> Windows:
+        return replace(by_grid[grid.counts], allowed=None if allowed is None else np.tile(allowed, (len(cell), 1)))
 
-    return refined(goal, len(made) - 1, solved(made[0], goal), made[0], lambda grid, _: by_grid[grid.counts], offer)
+    return refined(goal, len(made) - 1, solved(made[0], goal), made[0], finer)
 
 
 def painted(found: Refined, levels: int) -> np.ndarray:

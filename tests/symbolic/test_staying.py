@@ -14,12 +14,13 @@ import pytest
 from gapcert import Box, Domain, Goal, Interval, Model, Region, StateSpec, SynthesisProblem, closed_loop
 from gapcert.contracts.controllers.policies import POLICIES
 from gapcert.testing.toys import Drift
-from gapcert_cells import GridController, Successors
+from gapcert_cells import Along, GridController, Successors
 from gapcert_cells.testing import Band
-from gapcert_symbolic.cells.abstraction import Axis, Windows
+from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.games import games
-from gapcert_symbolic.solvers import solvers
+from gapcert_symbolic.solvers.problem import Problem, Solution
+from gapcert_symbolic.solvers.solvers import solve
 from gapcert_symbolic.synthesizer import Symbolic
 
 TURN = 2 * np.pi
@@ -35,7 +36,7 @@ def drawn(n: int, m: int, rng: np.random.Generator) -> Windows:
     last = first + rng.integers(0, 3, (n, m))
     allowed = rng.random((n, m)) < 0.9 if rng.random() < 0.5 else None
     tables = first.astype(np.int32), last.astype(np.int32)
-    return Windows(grid, (Axis((0,), False, np.arange(m), *tables),), allowed)
+    return Windows(grid, (Along((0,), False, np.arange(m), *tables),), allowed)
 
 
 def successors(windows: Windows) -> list[list[frozenset[int] | None]]:
@@ -89,10 +90,14 @@ def by_sets(windows: Windows, safe: np.ndarray, target: np.ndarray) -> np.ndarra
         x = y
 
 
+def stayed(windows: Windows, safe: np.ndarray, target: np.ndarray) -> Solution:
+    return games.reach_and_stay(Problem(lambda: windows, safe), target)
+
+
 def kept_alone(windows: Windows, safe: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Values where the target must not be left any more once it is kept; they are fewer."""
-    kept = solvers.invariance(windows, safe & target)
-    return solvers.reach_avoid(windows, safe, kept.values >= 0).values
+    kept = solve(Problem(lambda: windows, safe & target))
+    return solve(Problem(lambda: windows, safe, kept.values >= 0)).values
 
 
 def test_wins_what_some_strategy_wins() -> None:
@@ -100,13 +105,13 @@ def test_wins_what_some_strategy_wins() -> None:
     for _ in range(250):
         n = int(rng.integers(3, 8))
         windows, safe, target = drawn(n, int(rng.integers(1, 3)), rng), rng.random(n) < 0.97, rng.random(n) < 0.7
-        found = games.reach_and_stay(windows, safe, target).values >= 0
+        found = stayed(windows, safe, target).values >= 0
         assert np.array_equal(found, by_strategies(windows, safe, target))
         more += bool(found.sum() > (kept_alone(windows, safe, target) >= 0).sum())
     assert more >= 3
 
 
-def held(windows: Windows, safe: np.ndarray, target: np.ndarray, found: solvers.Solution) -> bool:
+def held(windows: Windows, safe: np.ndarray, target: np.ndarray, found: Solution) -> bool:
     """No kept input leads to a greater value, nor to an equal one but from a lasting value, whose cells are in the target."""
     after, bits = successors(windows), np.unpackbits(found.bits, axis=1, count=windows.inputs).astype(bool)
     for i in np.flatnonzero(found.values >= 0):
@@ -125,7 +130,7 @@ def test_many_games_are_those_of_the_formula_and_every_kept_input_keeps_the_prom
     for _ in range(300):
         n = int(rng.integers(5, 40))
         windows, safe, target = drawn(n, int(rng.integers(1, 4)), rng), rng.random(n) < 0.97, rng.random(n) < 0.7
-        found, before = games.reach_and_stay(windows, safe, target), kept_alone(windows, safe, target)
+        found, before = stayed(windows, safe, target), kept_alone(windows, safe, target)
         assert np.array_equal(found.values >= 0, by_sets(windows, safe, target))
         assert held(windows, safe, target, found)
         # The steps to where the target can be kept for ever are what they were.
@@ -141,12 +146,10 @@ def test_one_input_more_breaks_the_promise() -> None:
     rng, broken = np.random.default_rng(6), 0
     for _ in range(100):
         windows, safe, target = drawn(20, 3, rng), np.ones(20, dtype=bool), rng.random(20) < 0.6
-        found = games.reach_and_stay(windows, safe, target)
+        found = stayed(windows, safe, target)
         won = found.values >= 0
         every = games.leading(windows, won, won & np.isin(found.values, found.lasting))
-        broken += not held(
-            windows, safe, target, solvers.Solution(found.values, found.bits | every, found.rounds, found.lasting)
-        )
+        broken += not held(windows, safe, target, Solution(found.values, found.bits | every, found.rounds, found.lasting))
     assert broken > 20
 
 

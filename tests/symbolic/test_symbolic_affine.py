@@ -16,7 +16,8 @@ from gapcert_symbolic.cells.abstraction import windows
 from gapcert_symbolic.cells.bounds import Enclosed
 from gapcert_symbolic.cells.gaps import disturbance
 from gapcert_symbolic.cells.grid import Grid
-from gapcert_symbolic.solvers import affine, runs, solvers
+from gapcert_symbolic.solvers import affine, runs
+from gapcert_symbolic.solvers.problem import Solution
 from gapcert_symbolic.synthesizer import Symbolic
 
 
@@ -67,13 +68,11 @@ class Paused(Linear):
         return (u == 0) & self.still
 
 
-def by_tables(
-    bound: Enclosed, grid: Grid, axes: tuple[np.ndarray, ...], gap: Band | None, safe: np.ndarray
-) -> solvers.Solution:
+def by_tables(bound: Enclosed, grid: Grid, axes: tuple[np.ndarray, ...], gap: Band | None, safe: np.ndarray) -> Solution:
     paths = windows(bound, grid, axes, None if gap is None else disturbance(gap, grid, axes))
-    values, bits = np.where(safe, 0, -1).astype(np.int32), solvers._no_bits(paths)
-    runs.invariance(1, *solvers._given(paths), values, bits, solvers._allowed(paths), *paths.rows)
-    return solvers.Solution(values, bits, 1)
+    values, bits = np.where(safe, 0, -1).astype(np.int32), paths.no_bits
+    runs.invariance(1, paths.game, values, bits, *paths.rows)
+    return Solution(values, bits, 1)
 
 
 def textbook(found: affine.Maps, counts: tuple[int, ...], safe: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -123,7 +122,7 @@ def test_rows_that_are_left_out_are_missed() -> None:
     for seed in range(10):
         found, grid, safe = random_maps(2, seed)
         alive = textbook(found, grid.counts, safe)[0]
-        wrong += not np.array_equal(affine.invariance(replace(found, spare=-2.0), grid, safe)[0] == 0, alive)
+        wrong += not np.array_equal(affine.invariance(found._replace(spare=-2.0), grid, safe)[0] == 0, alive)
     assert wrong > 0
 
 
@@ -161,7 +160,7 @@ def test_both_ways_agree(n: int, seed: int, with_gap: bool) -> None:
     assert exact or np.mean(values != other.values) < 1e-3
 
 
-def paused(n: int, seed: int, gap: str) -> tuple[affine.Maps | None, solvers.Solution, solvers.Solution]:
+def paused(n: int, seed: int, gap: str) -> tuple[affine.Maps | None, Solution, Solution]:
     """Windows of a system that an input pauses, what they give in closed form, and what tables do."""
     rng = np.random.default_rng([seed, 7])
     slope = np.hstack([np.eye(n) + rng.uniform(-0.3, 0.3, (n, n)), rng.uniform(-0.4, 0.4, (n, 1))])
@@ -174,7 +173,7 @@ def paused(n: int, seed: int, gap: str) -> tuple[affine.Maps | None, solvers.Sol
     bound, safe = Enclosed(model), rng.random(grid.size) < 0.97
     found = affine.maps(bound, grid, axes, None if band is None else disturbance(band, grid, axes), None)
     other = by_tables(bound, grid, axes, band, safe)
-    return found, other if found is None else solvers.Solution(*affine.invariance(found, grid, safe.copy()), 1), other
+    return found, other if found is None else Solution(*affine.invariance(found, grid, safe.copy()), 1), other
 
 
 @pytest.mark.exam

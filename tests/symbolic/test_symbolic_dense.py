@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 from dataclasses import replace
 from typing import Any
@@ -11,13 +12,15 @@ import pytest
 
 from gapcert import Box, Domain, Goal, MissingDependency, Region, StateSpec, SynthesisProblem
 from gapcert.testing.toys import Drift
-from gapcert_cells import AutomatonController, GridController, automaton_of, read_hoa
+from gapcert_cells import Along, AutomatonController, GridController, automaton_of, read_hoa
 from gapcert_cells.testing import Band, rod_problem, rod_reach_avoid
-from gapcert_symbolic.cells.abstraction import Axis, Windows
+from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.games import games
-from gapcert_symbolic.games.automata import Labels, Play, product
-from gapcert_symbolic.solvers import dense, solvers
+from gapcert_symbolic.games.automata import Labels, product
+from gapcert_symbolic.solvers import dense
+from gapcert_symbolic.solvers.problem import Play, Problem, Solution
+from gapcert_symbolic.solvers.solvers import solve
 from gapcert_symbolic.synthesizer import Symbolic
 
 pytestmark = pytest.mark.needs("jax")
@@ -40,7 +43,7 @@ def drawn(seed: int, counts: tuple[int, ...], wraps: tuple[bool, ...]) -> Window
         first = rng.integers(-2, 2, size) if moves else rng.integers(-1, n + 1, size)
         first = first % n if wraps[k] else first
         last = first + rng.integers(0, min(3, n), size)
-        axes.append(Axis(on, moves, column, first.astype(np.int32), last.astype(np.int32)))
+        axes.append(Along(on, moves, column, first.astype(np.int32), last.astype(np.int32)))
     return Windows(grid, tuple(axes), rng.random((grid.size, m)) < 0.9 if seed else None)
 
 
@@ -51,11 +54,13 @@ def test_domains_values_and_inputs_are_equal(counts: tuple[int, ...], wraps: tup
     for seed in (1, 2, 3) if len(counts) > 2 else (0,):
         windows, rng = drawn(seed, counts, wraps), np.random.default_rng(seed)
         safe, target = rng.random(windows.grid.size) < 0.99, rng.random(windows.grid.size) < 0.15
+        compiled = Problem(functools.partial(drawn, seed, counts, wraps), safe)
+        jax = replace(compiled, solver="jax")
         for ours, other in [
-            (dense.invariance(windows, safe), solvers.invariance(windows, safe)),
-            (dense.reach_avoid(windows, safe, target), solvers.reach_avoid(windows, safe, target)),
-            (games.recurrence(windows, safe, target, dense), games.recurrence(windows, safe, target)),
-            (games.reach_and_stay(windows, safe, safe & ~target, dense), games.reach_and_stay(windows, safe, safe & ~target)),
+            (solve(jax), solve(compiled)),
+            (solve(replace(jax, target=target)), solve(replace(compiled, target=target))),
+            (games.recurrence(jax, target), games.recurrence(compiled, target)),
+            (games.reach_and_stay(jax, safe & ~target), games.reach_and_stay(compiled, safe & ~target)),
         ]:
             assert np.array_equal(ours.values, other.values)
             assert np.array_equal(ours.bits, other.bits)
@@ -97,7 +102,7 @@ def labelled(windows: Windows, seed: int) -> Labels:
     return Labels(must, must | np.where(rng.random(n) < 0.03, rng.integers(0, 4, n), 0))
 
 
-def both(seed: int, shape: int) -> list[tuple[solvers.Solution, solvers.Solution]]:
+def both(seed: int, shape: int) -> list[tuple[Solution, Solution]]:
     """Products with each automaton: on JAX, and compiled."""
     windows = drawn(seed, *SHAPES[shape])
     safe, labels = np.random.default_rng(seed).random(windows.grid.size) < 0.99, labelled(windows, seed)

@@ -8,9 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gapcert import Box, StateSpec
-from gapcert_symbolic.cells.abstraction import Axis, Windows
+from gapcert_cells import Along
+from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
-from gapcert_symbolic.solvers import erosion, runs, solvers
+from gapcert_symbolic.solvers import erosion, runs
+from gapcert_symbolic.solvers.problem import Problem
+from gapcert_symbolic.solvers.solvers import solve
 
 TURN = 2 * np.pi
 
@@ -34,7 +37,7 @@ def drawn(rng: np.random.Generator, counts: tuple[int, ...], m: int, wraps: tupl
         last = first + rng.integers(0, min(3, n), size)
         if not wraps[k]:
             last = np.minimum(last, n) if not moves else last
-        axes.append(Axis(on, moves, column, first.astype(np.int32), last.astype(np.int32)))
+        axes.append(Along(on, moves, column, first.astype(np.int32), last.astype(np.int32)))
     allowed = rng.random((grid.size, m)) < 0.8 if relations else None
     return Windows(grid, tuple(axes), allowed)
 
@@ -42,8 +45,8 @@ def drawn(rng: np.random.Generator, counts: tuple[int, ...], m: int, wraps: tupl
 def looked_at(windows: Windows, safe: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The other solver."""
     alive = np.where(safe, 0, -1).astype(np.int32)
-    bits = solvers._no_bits(windows)
-    runs.invariance(1, *solvers._given(windows), alive, bits, solvers._allowed(windows), *windows.rows)
+    bits = windows.no_bits
+    runs.invariance(1, windows.game, alive, bits, *windows.rows)
     return alive == 0, bits
 
 
@@ -63,8 +66,8 @@ def test_both_solvers_agree(n: int, m: int, seed: int, relations: bool) -> None:
     other, kept = looked_at(windows, safe)
     assert np.array_equal(alive, other)
     assert np.array_equal(bits, kept)
-    assert np.array_equal(solvers.invariance(windows, safe).bits, kept)
-    assert np.array_equal(solvers.invariance(windows, safe, 2).bits, kept)
+    for threads in (1, 2):
+        assert np.array_equal(solve(Problem(lambda: windows, safe, threads=threads)).bits, kept)
 
 
 def test_a_few_agree_and_some_of_them_win() -> None:
@@ -87,7 +90,7 @@ def test_the_longest_free_axis_lies_along_bits(longest: int) -> None:
     counts = (90, 20) if longest == 0 else (20, 90)
     one = np.zeros((1, 1), dtype=np.int32)
     grid = Grid(Box((StateSpec("a"), StateSpec("b")), (0, 0), (1, 1)), counts)
-    windows = Windows(grid, (Axis((), True, np.zeros(1, dtype=int), one, one),) * 2)
+    windows = Windows(grid, (Along((), True, np.zeros(1, dtype=int), one, one),) * 2)
     order = erosion.order(windows)
     assert order is not None
     assert order[-1] == longest
@@ -97,8 +100,8 @@ def test_axes_that_depend_on_each_other_have_no_order() -> None:
     grid = Grid(Box((StateSpec("a"), StateSpec("b"), StateSpec("c")), (0, 0, 0), (1, 1, 1)), (3, 4, 5))
     column = np.zeros(1, dtype=int)
 
-    def axis(on: tuple[int, ...], rows: int) -> Axis:
-        return Axis(on, True, column, np.zeros((rows, 1), dtype=np.int32), np.zeros((rows, 1), dtype=np.int32))
+    def axis(on: tuple[int, ...], rows: int) -> Along:
+        return Along(on, True, column, np.zeros((rows, 1), dtype=np.int32), np.zeros((rows, 1), dtype=np.int32))
 
     assert erosion.order(Windows(grid, (axis((1,), 4), axis((0,), 3), axis((), 1)))) is None
     assert erosion.order(Windows(grid, (axis((1,), 4), axis((), 1), axis((0,), 3)))) == (1, 0, 2)

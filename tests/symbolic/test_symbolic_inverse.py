@@ -11,12 +11,14 @@ from hypothesis import strategies as st
 
 from gapcert import Box, StateSpec
 from gapcert.plugin import Automaton, Bools
+from gapcert_cells import Along
 from gapcert_symbolic.cells import repeats
-from gapcert_symbolic.cells.abstraction import Axis, Windows
+from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.games import automata
-from gapcert_symbolic.kernels import inverse, kernels
+from gapcert_symbolic.kernels import inverse, reach
 from gapcert_symbolic.solvers import solvers
+from gapcert_symbolic.solvers.problem import Play
 
 TURN = 2 * np.pi
 
@@ -34,27 +36,25 @@ def drawn(rng: np.random.Generator, counts: tuple[int, ...], m: int, wraps: tupl
         first = rng.integers(-3, 3, size) if moves else rng.integers(-1, n + 1, size)
         first = first % n if wraps[k] else first
         last = first + rng.integers(0, min(3, n), size)
-        axes.append(Axis(on, moves, column, first.astype(np.int32), last.astype(np.int32)))
+        axes.append(Along(on, moves, column, first.astype(np.int32), last.astype(np.int32)))
     allowed = rng.random((grid.size, m)) < 0.8 if relations else None
     return Windows(grid, tuple(axes), allowed)
 
 
-def both(windows: Windows, safe: Bools, target: Bools) -> list[tuple[np.ndarray, np.ndarray, int]]:
-    """(values, bits, rounds) by either way."""
+def both(windows: Windows, safe: Bools, target: Bools) -> list[tuple[np.ndarray, np.ndarray]]:
+    """(values, bits) by either way."""
     start, out = np.where(target & safe, 0, np.where(safe, -1, -2)).astype(np.int32), []
-    size, allowed = windows.grid.size, solvers._allowed(windows)
+    given = repeats.inverse(windows, np.int64)
+    assert given is not None
     for threads in (1, 2):
-        values, bits = start.copy(), solvers._no_bits(windows)
-        rounds = inverse.reach(windows, values, bits, allowed, threads)
-        assert rounds is not None
-        out.append((values, bits, rounds))
+        values, bits = start.copy(), windows.no_bits
+        inverse.reach(given, values, bits, windows.permitted, threads)
+        out.append((values, bits))
     assert np.array_equal(out[0][0], out[1][0])
     assert np.array_equal(out.pop()[1], out[0][1])
-    values, bits = start.copy(), solvers._no_bits(windows)
-    lists = np.full(size, -1, np.int64), np.empty(size * windows.inputs, np.int64)
-    near = solvers._near(windows, target & safe)
-    rounds = kernels.reach(*solvers._given(windows), values, bits, allowed, near, *lists)
-    return [*out, (values, bits, rounds)]
+    values, bits = start.copy(), windows.no_bits
+    reach.reach(windows.game, values, bits)
+    return [*out, (values, bits)]
 
 
 @pytest.mark.exam
@@ -66,10 +66,9 @@ def test_both_ways_agree(n: int, m: int, seed: int, relations: bool) -> None:
     wraps = (False, *(bool(v) for v in rng.random(n - 1) < 0.4))
     windows = drawn(rng, counts, m, wraps, relations)
     size = windows.grid.size
-    (values, bits, rounds), (other, kept, levels) = both(windows, rng.random(size) < 0.97, rng.random(size) < 0.1)
+    (values, bits), (other, kept) = both(windows, rng.random(size) < 0.97, rng.random(size) < 0.1)
     assert np.array_equal(values, other)
     assert np.array_equal(bits, kept)
-    assert rounds == levels
 
 
 @pytest.mark.parametrize("nodes", [1, 1 << 12])
@@ -79,10 +78,10 @@ def test_nodes_run_out(monkeypatch: pytest.MonkeyPatch, nodes: int) -> None:
     rng = np.random.default_rng(11)
     windows = drawn(rng, (60, 9, 8), 12, (False, False, True), False)
     size = windows.grid.size
-    (values, bits, rounds), (other, kept, _) = both(windows, rng.random(size) < 0.98, np.arange(size) < 160)
+    (values, bits), (other, kept) = both(windows, rng.random(size) < 0.98, np.arange(size) < 160)
     assert np.array_equal(values, other)
     assert np.array_equal(bits, kept)
-    assert rounds > 5
+    assert values.max() > 5
     assert 0.2 < (values >= 0).mean() < 0.99
 
 
@@ -90,8 +89,8 @@ def test_no_classes_where_every_axis_matters() -> None:
     grid = Grid(Box((StateSpec("a"), StateSpec("b")), (0, 0), (1, 1)), (5, 6))
     column = np.zeros(1, dtype=int)
 
-    def axis(on: tuple[int, ...], rows: int) -> Axis:
-        return Axis(on, True, column, np.zeros((rows, 1), dtype=np.int32), np.zeros((rows, 1), dtype=np.int32))
+    def axis(on: tuple[int, ...], rows: int) -> Along:
+        return Along(on, True, column, np.zeros((rows, 1), dtype=np.int32), np.zeros((rows, 1), dtype=np.int32))
 
     assert repeats.inverse(Windows(grid, (axis((1,), 6), axis((0,), 5))), np.int32) is None
     assert repeats.inverse(Windows(grid, (axis((1,), 6), axis((), 1))), np.int32) is not None
@@ -114,7 +113,7 @@ def test_both_ways_agree_on_positions(n: int, m: int, seed: int, relations: bool
     must = rng.choice(4, size, p=[0.7, 0.1, 0.1, 0.1])
     labels = automata.Labels(must, must | rng.choice(4, size, p=[0.8, 0.1, 0.05, 0.05]))
     safe, found = rng.random(size) < 0.97, []
-    play = automata.Play.of(windows, safe, automaton, labels)
+    play = Play(windows, safe, automaton, *automata.leads_of(automaton, labels))
     for game in (automata.Watched(play) for _ in range(2)):
         assert game.repeats is not None
         if found:

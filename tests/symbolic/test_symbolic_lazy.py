@@ -12,12 +12,13 @@ import pytest
 import gapcert as gc
 from gapcert import Box, Domain, GapFunction, Goal, Interval, Model, Region, StateSpec, SynthesisProblem
 from gapcert.testing.toys import Opaque
-from gapcert_cells import GridController
-from gapcert_symbolic.cells.abstraction import Axis, Windows
+from gapcert_cells import Along, GridController
+from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.bounds import Enclosed, Grown
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.kernels import lazy_kernels
-from gapcert_symbolic.solvers import lazy, runs, solvers
+from gapcert_symbolic.solvers import lazy, runs
+from gapcert_symbolic.solvers.problem import Dynamics, Problem
 from gapcert_symbolic.synthesizer import Symbolic
 
 RANGES = {"omega": (-4.0, 4.0), "theta": (-np.pi, np.pi), "torque": (-6.0, 6.0)}
@@ -185,7 +186,8 @@ def test_a_bound_that_does_not_grow_is_one_of_cells() -> None:
     half = grid.widths / 2
     bound, axes = Grown(problem.model, Still(radii(), half), half * 1e-10), (np.linspace(-6, 6, 5),)
     assert lazy.suits(bound, grid, axes)
-    assert lazy.solved(bound, grid, axes, None, None, np.ones(grid.size, dtype=bool)) is None
+    dynamics = Dynamics(bound, grid, axes, None, None)
+    assert lazy.solve(Problem(cache(list), np.ones(grid.size, dtype=bool), dynamics=dynamics)) is None
     one, other = (made(problem, growth=radius) for radius in (radii(), Still(radii(), half)))
     assert np.array_equal(one.values >= 0, other.values >= 0)
     assert np.array_equal(one.bits, other.bits)
@@ -236,7 +238,7 @@ def drawn(n: int, seed: int) -> tuple[Windows, np.ndarray]:
             first = first % count
         else:
             first, last = (np.clip(end, -1, count) for end in (first, last))
-        axes.append(Axis(every, False, np.arange(m), first.astype(np.int32), last.astype(np.int32)))
+        axes.append(Along(every, False, np.arange(m), first.astype(np.int32), last.astype(np.int32)))
     kinds = ["angle" if w else "real" for w in wraps]
     states = tuple(StateSpec(f"x{k}", "rad", kind) for k, kind in enumerate(kinds))
     box = Box(states, tuple(-np.pi if w else 0.0 for w in wraps), tuple(np.pi if w else 1.0 for w in wraps))
@@ -268,8 +270,8 @@ def test_drawn_windows(n: int) -> None:
     some = 0
     for seed in range(12 if n == 1 else 6):
         windows, safe = drawn(n, seed)
-        alive, bits = np.where(safe, 0, -1).astype(np.int32), solvers._no_bits(windows)
-        runs.invariance(1, *solvers._given(windows), alive, bits, solvers._allowed(windows), *windows.rows)
+        alive, bits = np.where(safe, 0, -1).astype(np.int32), windows.no_bits
+        runs.invariance(1, windows.game, alive, bits, *windows.rows)
         found, nested = lazy.invariance(hulls(windows), windows.grid, safe, windows.inputs, windows.allowed)
         assert nested
         assert np.array_equal(found.values, alive)

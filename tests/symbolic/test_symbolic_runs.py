@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gapcert import Box, StateSpec
-from gapcert_symbolic.cells.abstraction import Axis, Windows
+from gapcert_cells import Along
+from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
-from gapcert_symbolic.kernels import kernels
-from gapcert_symbolic.solvers import runs, solvers
+from gapcert_symbolic.solvers import runs
 
 
 def drawn(n: int, m: int, seed: int, order: int) -> tuple[Windows, np.ndarray]:
@@ -19,7 +19,7 @@ def drawn(n: int, m: int, seed: int, order: int) -> tuple[Windows, np.ndarray]:
     (−1), or in none (0); and safe cells.
     """
     rng = np.random.default_rng(seed)
-    counts, axes = tuple(int(v) for v in rng.integers(2, {1: 60, 2: 25, 3: 9}[n], n)), list[Axis]()
+    counts, axes = tuple(int(v) for v in rng.integers(2, {1: 60, 2: 25, 3: 9}[n], n)), list[Along]()
     for k, count in enumerate(counts):
         moves = bool(rng.random() < 0.7)
         on = tuple(d for d in range(n) if (d != k and rng.random() < 0.6) or (d == k and not moves))
@@ -28,14 +28,14 @@ def drawn(n: int, m: int, seed: int, order: int) -> tuple[Windows, np.ndarray]:
         last, column = first + rng.integers(0, 3, size), np.arange(m) if k == n - 1 else np.zeros(m, dtype=np.int64)
         if k == n - 1 and order:
             first, last = (np.sort(end, axis=1)[:, ::order] for end in (first, last))
-        axes.append(Axis(on, moves, column, first.astype(np.int32), last.astype(np.int32)))
+        axes.append(Along(on, moves, column, first.astype(np.int32), last.astype(np.int32)))
     grid = Grid(Box(tuple(StateSpec(f"x{k}") for k in range(n)), (0.0,) * n, (1.0,) * n), counts)
     return Windows(grid, tuple(axes)), rng.random(grid.size) < 0.97
 
 
 def solved(windows: Windows, safe: np.ndarray, allowed: np.ndarray, threads: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    alive, bits = np.where(safe, 0, -1).astype(np.int32), solvers._no_bits(windows)
-    runs.invariance(threads, *solvers._given(windows), alive, bits, allowed, *windows.rows)
+    alive, bits = np.where(safe, 0, -1).astype(np.int32), windows.no_bits
+    runs.invariance(threads, windows.game._replace(allowed=allowed), alive, bits, *windows.rows)
     return alive, bits
 
 
@@ -61,8 +61,7 @@ def textbook(windows: Windows, safe: np.ndarray) -> tuple[np.ndarray, np.ndarray
 @given(st.integers(1, 3), st.integers(1, 20), st.integers(0, 2**32 - 1), st.sampled_from([1, -1, 0]))
 def test_in_order_as_one_by_one(n: int, m: int, seed: int, order: int) -> None:
     windows, safe = drawn(n, m, seed, order)
-    _, wraps, packed = solvers._given(windows)
-    assert order == 0 or runs._sense(wraps, packed) in (order, 1)  # windows that are the same are in both orders
+    assert order == 0 or runs._sense(windows.game) in (order, 1)  # windows that are the same are in both orders
     both = np.empty((0, 0), dtype=bool), np.ones((len(safe), m), dtype=bool)
     found = [solved(windows, safe, allowed, threads) for allowed in both for threads in (1, 2)]
     for alive, bits in found:
@@ -84,12 +83,12 @@ def test_windows_in_no_order_are_not_taken_together() -> None:
     wrong = 0
     for seed in range(10):
         windows, safe = drawn(2, 9, seed, 0)
-        (counts, wraps, packed), (alive, bits) = solvers._given(windows), solved(windows, safe, np.empty((0, 0), dtype=bool))
-        assert runs._sense(wraps, packed) == 0
-        strides, run, other = kernels._strides(counts), np.empty(len(safe), np.int32), solvers._no_bits(windows)
-        runs._count(alive, counts[-1], run)
-        room = np.zeros((4, len(counts)), np.int64)
-        runs._valid_in_order(counts, wraps, packed, strides, alive, run, 1, other, room, 0, counts[0])
+        game, (alive, bits) = windows.game, solved(windows, safe, np.empty((0, 0), dtype=bool))
+        assert runs._sense(game) == 0
+        run, other, room = np.empty(len(safe), np.int32), windows.no_bits, np.zeros((4, len(game.counts)), np.int64)
+        runs._count(alive, game.counts[-1], run)
+        own = runs.Own(run, room[0], room[1:], np.zeros((2, 0), np.int64))
+        runs._valid_in_order(game, alive, own, 1, other, 0, game.counts[0])
         wrong += not np.array_equal(bits, other)
     assert wrong > 0
 
@@ -114,9 +113,8 @@ def test_threads_that_do_not_learn_what_died_keep_too_much(monkeypatch: pytest.M
 
 def test_an_axis_that_wraps_is_in_no_order() -> None:
     windows, _ = drawn(2, 5, 3, 1)
-    _, wraps, packed = solvers._given(windows)
-    assert runs._sense(wraps, packed) == 1
-    assert runs._sense(np.array([False, True]), packed) == 0
+    assert runs._sense(windows.game) == 1
+    assert runs._sense(windows.game._replace(wraps=np.array([False, True]))) == 0
 
 
 @settings(max_examples=40, deadline=None, derandomize=True)

@@ -14,7 +14,7 @@ from gapcert_cells.automaton_controller import AutomatonController
 from gapcert_cells.input_choice import efforts
 
 from . import c_memory
-from .parts import Exported, ends_of, memory_tables, parts_of, winning_of
+from .parts import Exported, cells_of, ends_of, memory_tables, parts_of, winning_of
 
 LARGEST = 30_000_000
 """Numbers in the tables of a C file: what compilers still take as text."""
@@ -183,7 +183,6 @@ def write_c(controller: Exported, out: Path) -> list[Path]:
     parts, stay = parts_of(controller), controller.goal.stay
     one, memory = parts[0], isinstance(controller, AutomatonController)
     sets, which = np.unique(np.concatenate([part.bits for part in parts]), axis=0, return_inverse=True)
-    cells = len(one.values) if one.splits is None else int((one.splits.first == 0).sum())
     numbers = len(one.values) * (2 * (len(parts) + memory) + (one.splits is not None)) + sets.size
     if numbers > LARGEST:
         raise UsageError(f"export: C tables of {numbers:,} numbers (limit {LARGEST:,}); use --to numpy, or fewer cells")
@@ -192,7 +191,7 @@ def write_c(controller: Exported, out: Path) -> list[Path]:
         "passed": "memory, " if memory else "",
         "moved": MOVED if memory else "",
     }
-    counts = {"nx": len(stay.axes), "nu": one.points.shape[1], "points": len(one.points), "cells": cells}
+    counts = {"nx": len(stay.axes), "nu": one.points.shape[1], "points": len(one.points), "cells": cells_of(controller)}
     # Names of a stranger's controller stand in a comment, which they must not end.
     told = ", ".join(f"{a.name} [{a.unit or '1'}]" for a in stay.axes).replace("*/", "* /").replace("/*", "/ *")
     names = {"states": harmless(" ".join(told.replace("\\", "/").split())), "digest": controller.digest()}

@@ -13,7 +13,7 @@ from gapcert_cells.load import load_controller
 
 from .c import write_c
 from .numpy import write_numpy
-from .parts import Exported, parts_of, winning_of
+from .parts import Exported, cells_of, parts_of, winning_of
 
 FORMS: dict[str, Callable[[Exported, Path], list[Path]]] = {"c": write_c, "numpy": write_numpy}
 
@@ -52,13 +52,11 @@ def export(controller: Controller, to: str, out: Path | str) -> dict[str, Any]:
     except OSError as error:
         raise UsageError(f"{out}: cannot be made ({error.strerror}); choose another folder with --out") from None
     files = FORMS[to](controller, out)
-    splits = parts[0].splits
-    cells = len(parts[0].values) if splits is None else int((splits.first == 0).sum())
-    facts = {"cells": cells, "winning_cells": winning}
     return {
         "to": to,
         "files": [str(f) for f in files],
-        **facts,
+        "cells": cells_of(controller),
+        "winning_cells": winning,
         **({"memories": len(parts)} if isinstance(controller, AutomatonController) else {}),
         "inputs": len(parts[0].points),
         "digest": controller.digest(),

@@ -35,7 +35,7 @@ def write_numpy(controller: Exported, out: Path) -> list[Path]:
         "digest": np.array(controller.digest()),
     }
     tables |= memory_tables(controller) if isinstance(controller, AutomatonController) else {}
-    if (splits := parts_of(controller)[0].splits) is not None:
-        tables |= {"splits": splits.first, "halvings": np.array(splits.levels)}
+    if one.splits is not None:
+        tables |= {"splits": one.splits.first, "halvings": np.array(one.splits.levels)}
     write_atomic(data, npz_bytes(tables, compress=True))
     return [program, data]

@@ -21,6 +21,11 @@ def parts_of(controller: Exported) -> tuple[GridController, ...]:
     return controller.parts if isinstance(controller, AutomatonController) else (controller,)
 
 
+def cells_of(controller: Exported) -> int:
+    one = parts_of(controller)[0]
+    return len(one.values) if one.splits is None else int((one.splits.first == 0).sum())
+
+
 def winning_of(controller: Exported) -> int:
     """Cells of the domain, with some memory."""
     return int(np.any([part.values >= 0 for part in parts_of(controller)], axis=0).sum())

@@ -8,10 +8,11 @@ from dataclasses import dataclass, field, replace
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 
 from gapcert import Array, Interval, UsageError
 from gapcert.plugin import Bools, Ints
+from gapcert_cells import Along, Successors
+from gapcert_symbolic.kernels.kernels import Bits, Game, Packed, _strides
 
 from .bounds import Bound, Grown
 from .gaps import Disturbance, fitted
@@ -26,33 +27,16 @@ MEMORY, BYTES = 8e9, 8  # in all; per cell, without its inputs
 
 @final
 @dataclass(frozen=True)
-class Axis:
-    """Where successors lie along one axis of the grid: cells first … last, both included, by rows and columns.
-
-    A row is a cell of the product of the axes `on`, in C order; column (m,) is that of each input. Where it `moves`, indices
-    count from the cell's own. On a bounded axis what lies beyond the grid is −1 or n before the own index is added, or further
-    out; on one that wraps, 0 ≤ first < n and last − first < n, and indices count modulo n. row: of each cell in question, where
-    there are rows for some cells only.
-    """
-
-    on: tuple[int, ...]
-    moves: bool
-    column: Ints
-    first: npt.NDArray[np.int32]
-    last: npt.NDArray[np.int32]
-    row: Ints | None = None
-
-
-@final
-@dataclass(frozen=True)
 class Windows:
     """Cells that the successors may touch: per axis of the grid a table.
 
-    allowed (cells, inputs): what the relations of the domain leave; None is everything. told: how the gap entered.
+    On a bounded axis what lies beyond the grid is −1 or n before the own index is added, or further out; on one that wraps,
+    0 ≤ first < n and last − first < n, and indices count modulo n. allowed (cells, inputs): what the relations of the domain
+    leave; None is everything. told: how the gap entered.
     """
 
     grid: Grid
-    axes: tuple[Axis, ...]
+    axes: tuple[Along, ...]
     allowed: Bools | None = None
     told: Mapping[str, Any] = field(default_factory=dict)
 
@@ -60,27 +44,23 @@ class Windows:
     def inputs(self) -> int:
         return len(self.axes[0].column)
 
+    @property
+    def successors(self) -> Successors:
+        """As controllers have them."""
+        return Successors(self.grid.counts, self.grid.wraps, self.axes)
+
     def ends(self, cell: Ints, which: Ints) -> tuple[Ints, Ints]:
         """First and last cell of each axis (n, axes), of pairs of a flat cell and an input; −1 and n are outside."""
-        index = np.unravel_index(cell, self.grid.counts)
-        ends = np.empty((2, len(cell), len(self.axes)), dtype=np.int64)
-        for k, axis in enumerate(self.axes):
-            on = axis.on
-            row = np.ravel_multi_index([index[d] for d in on], [self.grid.counts[d] for d in on]) if on else 0
-            own = index[k] if axis.moves else 0
-            for end, table in zip(ends, (axis.first, axis.last), strict=True):
-                end[:, k] = own + table[row, axis.column[which]]
-            if not self.grid.wraps[k]:
-                ends[:, :, k] = np.clip(ends[:, :, k], -1, self.grid.counts[k])
+        ends = np.stack(self.successors.ends(cell, which))
+        for k, (n, wraps) in enumerate(zip(self.grid.counts, self.grid.wraps, strict=True)):
+            if not wraps:
+                ends[:, :, k] = np.clip(ends[:, :, k], -1, n)
         return ends[0], ends[1]
 
     @property
-    def packed(self) -> tuple[Any, ...]:
-        """Tables of all axes in one, as the compiled solvers read them: (first, last, start, strides, moves, column).
-
-        The entry of axis k is at start_k + Σ_d index_d strides_kd + column_kj.
-        """
-        n = len(self.axes)
+    def game(self) -> Game:
+        """As the compiled solvers have it."""
+        n, offset = len(self.axes), [a.row * a.first.shape[1] for a in self.axes if a.row is not None]
         strides, start, at = np.zeros((n, n), dtype=np.int64), np.zeros(n, dtype=np.int64), 0
         for k, axis in enumerate(self.axes):
             start[k], step = at, axis.first.shape[1]
@@ -88,7 +68,30 @@ class Windows:
                 strides[k, d], step = step, step * self.grid.counts[d]
             at += axis.first.size
         first, last = (np.concatenate([getattr(a, end).ravel() for a in self.axes]) for end in ("first", "last"))
-        return first, last, start, strides, np.array([a.moves for a in self.axes]), np.stack([a.column for a in self.axes])
+        moves, column = np.array([a.moves for a in self.axes]), np.stack([a.column for a in self.axes])
+        rows, none = np.stack(offset) if offset else np.empty((n, 0), dtype=np.int64), np.empty(0, dtype=np.int64)
+        packed = Packed(first, last, start, strides, rows, moves, column)
+        counts, wraps = np.array(self.grid.counts), np.array(self.grid.wraps)
+        return Game(counts, wraps, _strides(counts), packed, self.permitted, self.grid.size, 0, none, 0, none)
+
+    @property
+    def permitted(self) -> Bools:
+        """`allowed` as the compiled solvers have it: empty where it is None."""
+        return np.empty((0, 0), dtype=bool) if self.allowed is None else self.allowed
+
+    @property
+    def every(self) -> Bits:
+        """All inputs that the relations leave, packed: (cells, bytes), or (1, bytes) where they leave all."""
+        return np.packbits(np.ones((1, self.inputs), dtype=bool) if self.allowed is None else self.allowed, axis=1)
+
+    @property
+    def no_bits(self) -> Bits:
+        """(cells, bytes) of no inputs."""
+        return np.zeros((self.grid.size, (self.inputs + 7) // 8), dtype=np.uint8)
+
+    def offered(self, cells: Bools) -> Bits:
+        """All inputs that the relations leave, packed, in some of the cells (cells,)."""
+        return np.where(cells[:, None], self.every, np.uint8(0))
 
     @property
     def rows(self) -> tuple[Ints, Ints]:
@@ -98,19 +101,6 @@ class Windows:
         shape = (n if 0 in axis.on else 1, -1)
         ends = np.stack([axis.first.reshape(shape).min(axis=1), axis.last.reshape(shape).max(axis=1)])
         least, most = ends + (np.arange(n) if axis.moves else np.zeros(n, dtype=np.int64))
-        return least, most
-
-    @property
-    def reach(self) -> tuple[Ints, Ints]:
-        """Least first and largest last cell of each axis, counted from the own index."""
-        least, most = np.empty((2, len(self.axes)), dtype=np.int64)
-        for k, axis in enumerate(self.axes):
-            first, last = axis.first.min(axis=1), axis.last.max(axis=1)
-            own = np.zeros(len(first), dtype=np.int64)
-            if k in axis.on:
-                own = np.indices([self.grid.counts[d] for d in axis.on])[axis.on.index(k)].ravel()
-            n = 0 if axis.moves or k in axis.on else self.grid.counts[k] - 1
-            least[k], most[k] = (first - own).min() - n, (last - own).max()
         return least, most
 
 
@@ -166,7 +156,7 @@ def windows(
     for k, (part, wide) in enumerate(zip(own, made.parts, strict=True)):
         alike.setdefault((part.on, part.inputs, wide.on, wide.inputs), []).append(k)
     views = {on: grid.along(on, cell) for _, _, on, _ in alike}
-    total, done, tables = sum(views[on][0].size for _, _, on, _ in alike), 0, dict[int, Axis]()
+    total, done, tables = sum(views[on][0].size for _, _, on, _ in alike), 0, dict[int, Along]()
     for (_, _, on, _), ks in alike.items():
 
         def told(rows: int, before: int = done) -> None:
@@ -202,7 +192,7 @@ class _Asked:
 
 def _tables(
     asked: _Asked, added: Disturbance | None, over: tuple[View, Ints | None], told: Callable[[int], None]
-) -> dict[int, Axis]:
+) -> dict[int, Along]:
     """Of axes that depend on the same, for which f is asked once."""
     one, (view, row) = next(iter(asked.own.values())), over
     wide, grid = next(iter(asked.wide.values())), view.whole
@@ -233,7 +223,7 @@ def _tables(
         told(stop)
     for k, part_ in asked.wide.items():
         _stay(asked.bound, view, asked.axes, added, k, part_, column, ends[k])
-    return {k: Axis(p.on, p.moves, column, ends[k][0], ends[k][1], row) for k, p in asked.wide.items()}
+    return {k: Along(p.on, p.moves, column, ends[k][0], ends[k][1], row) for k, p in asked.wide.items()}
 
 
 def _counted(grid: Grid, k: int, cell: Ints, ends: tuple[Array, Array]) -> tuple[Array, Array]:

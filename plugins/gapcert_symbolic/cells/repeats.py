@@ -49,10 +49,10 @@ class Inverse(NamedTuple):
 
 
 @compiled
-def _relative(counts: Ints, wraps: Bools, packed: Any, free: Bools, index: Ints, j: int, a: Ints, b: Ints) -> bool:
+def _relative(game: Any, free: Bools, index: Ints, j: int, a: Ints, b: Ints) -> bool:
     """Window of a cell that is 0 along the free axes; False where it leaves the grid from every cell of the class."""
-    _window(counts, wraps, packed, index, j, a, b)
-    fits = True
+    _window(game, 0, index, j, a, b)
+    counts, wraps, fits = game.counts, game.wraps, True
     for k in range(len(counts)):
         if free[k]:
             fits = fits and a[k] > -counts[k] and b[k] < counts[k]
@@ -69,15 +69,15 @@ def _far(counts: Ints, wraps: Bools, index: Ints, a: Ints, b: Ints, k: int) -> i
 
 
 @compiled
-def _tally(counts: Ints, wraps: Bools, packed: Any, free: Bools, some: Ints, classes: int) -> tuple[Ints, Ints, Ints]:
+def _tally(game: Any, free: Bools, some: Ints, classes: int) -> tuple[Ints, Ints, Ints]:
     """Start of each class, the widest window along each axis, and the margins. some (axes,): counts, and 1 where free."""
-    n, m = len(counts), packed[5].shape[1]
+    counts, wraps, n, m = game.counts, game.wraps, len(game.counts), game.packed.column.shape[1]
     strides, start = _strides(some), np.zeros(classes + 1, np.int64)
     most, margin = np.ones(n, np.int64), np.zeros((2, n), np.int64)
     index, a, b = np.zeros((3, n), np.int64)
     for _ in range(classes):
         for j in range(m):
-            if _relative(counts, wraps, packed, free, index, j, a, b):
+            if _relative(game, free, index, j, a, b):
                 at = 0
                 for k in range(n):
                     most[k] = max(most[k], b[k] - a[k] + 1)
@@ -95,26 +95,15 @@ def _tally(counts: Ints, wraps: Bools, packed: Any, free: Bools, some: Ints, cla
 
 
 @compiled
-def _fill(
-    counts: Ints,
-    wraps: Bools,
-    packed: Any,
-    free: Bools,
-    some: Ints,
-    most: Ints,
-    place: Ints,
-    known: Any,
-    entries: Any,
-    seen: Ints,
-) -> int:
+def _fill(game: Any, free: Bools, some: Ints, most: Ints, place: Ints, known: Any, entries: Any, seen: Ints) -> int:
     """Fill the entries (back, lows, input, shape) and `seen` (shapes, 2 axes): extent, and cells up to where it wraps."""
-    n, m, shapes = len(counts), packed[5].shape[1], 0
+    counts, wraps, n, m, shapes = game.counts, game.wraps, len(game.counts), game.packed.column.shape[1], 0
     back, lows, inputs, shape = entries
-    narrow, strides = _strides(some), _strides(counts)
+    narrow = _strides(some)
     index, a, b, c = np.zeros((4, n), np.int64)
     for _ in range(len(place) - 1):
         for j in range(m):
-            if _relative(counts, wraps, packed, free, index, j, a, b):
+            if _relative(game, free, index, j, a, b):
                 at, flat, key, f = 0, 0, 0, 0
                 for k in range(n):
                     size, far = b[k] - a[k] + 1, _far(counts, wraps, index, a, b, k)
@@ -125,7 +114,7 @@ def _fill(
                     if not free[k]:
                         c[k] = c[k] % counts[k]
                         at += c[k] * narrow[k]
-                    flat += (c[k] - index[k]) * strides[k]
+                    flat += (c[k] - index[k]) * game.strides[k]
                 e = place[at]
                 place[at] = e + 1
                 for k in range(n):
@@ -182,18 +171,18 @@ def inverse(windows: Windows, whole: Any) -> Inverse | None:
     classes = math.prod(c for c, own in zip(grid.counts, free, strict=True) if not own)
     if grid.size < SHARE * classes:
         return None
-    counts, wraps, packed = np.array(grid.counts), np.array(grid.wraps), windows.packed
+    game, counts, wraps = windows.game, np.array(grid.counts), np.array(grid.wraps)
     some = np.where(free, 1, counts)
-    start, most, margin = _tally(counts, wraps, packed, free, some, classes)
+    start, most, margin = _tally(game, free, some, classes)
     keys, size = 2**n * math.prod(int(w) for w in most) * math.prod(int(w) for w in most[wraps]), int(start[-1])
     if keys > SHAPES:
         return None
     back, lows = np.empty(size, whole), np.empty((size, int(free.sum())), np.int32)
     entries = (back, lows, *np.empty((2, size), np.int32))
     known, seen = np.full(keys, -1, np.int32), np.empty((min(keys, size), 3, n), np.int64)
-    shapes = _fill(counts, wraps, packed, free, some, most, start.copy(), known, entries, seen)
+    shapes = _fill(game, free, some, most, start.copy(), known, entries, seen)
     begin, cells = np.zeros(shapes + 1, np.int64), []
-    strides = _strides(counts)
+    strides = game.strides
     reach = np.stack([seen[:shapes, 2], 1 - seen[:shapes, 2]], axis=1) * (seen[:shapes, :1] - 1)
     for s, (size, split, far) in enumerate(seen[:shapes]):
         at = np.indices(size).reshape(n, -1).T

@@ -15,13 +15,12 @@ import numpy.typing as npt
 
 from gapcert import Goal, Region
 from gapcert.plugin import Automaton, Bools, Ints
+from gapcert_symbolic.cells import repeats
 from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
-from gapcert_symbolic.cells.repeats import inverse
-from gapcert_symbolic.kernels.inverse import LOST, NODES, OPEN, Found, states
-from gapcert_symbolic.kernels.positions import least, repeated
-from gapcert_symbolic.solvers import solvers
-from gapcert_symbolic.solvers.solvers import Solution
+from gapcert_symbolic.kernels import inverse, reach
+from gapcert_symbolic.kernels.kernels import whole
+from gapcert_symbolic.solvers.problem import Play, Solution
 
 from .games import inside, leading, touching
 
@@ -39,9 +38,9 @@ class Labels:
         """Of all cells, or of some."""
         must, may = np.zeros((2, grid.size if cell is None else len(cell)), dtype=np.int64)
         for p, region in enumerate(regions):
-            whole = inside(grid, region, cell)
-            must |= whole.astype(np.int64) << p
-            may |= (touching(grid, region, cell) | whole).astype(np.int64) << p
+            within = inside(grid, region, cell)
+            must |= within.astype(np.int64) << p
+            may |= (touching(grid, region, cell) | within).astype(np.int64) << p
         return cls(must, may)
 
     def followed_by(self, other: Labels) -> Labels:
@@ -49,33 +48,13 @@ class Labels:
 
     def kinds(self) -> tuple[list[list[int]], Ints]:
         """The letters that the cells of each kind may be read as, and the kind of every cell."""
-        whole = 1 + int(self.may.max(initial=0))
-        both = self.must * whole + self.may
+        size = 1 + int(self.may.max(initial=0))
+        both = self.must * size + self.may
         found = np.flatnonzero(np.bincount(both))
-        letters = [[n for n in range(b + 1) if n & ~b == 0 and a & ~n == 0] for a, b in (divmod(int(v), whole) for v in found)]
-        number = np.zeros(whole**2, dtype=np.int64)
+        letters = [[n for n in range(b + 1) if n & ~b == 0 and a & ~n == 0] for a, b in (divmod(int(v), size) for v in found)]
+        number = np.zeros(size**2, dtype=np.int64)
         number[found] = np.arange(len(found))
         return letters, number[both]
-
-
-@final
-@dataclass(frozen=True)
-class Play:
-    """leads[q, kind, t]: a cell of that kind may take the automaton from q to t, the last t being nowhere; kind (cells,)."""
-
-    windows: Windows
-    safe: Bools
-    automaton: Automaton
-    leads: Bools
-    kind: Ints
-
-    @classmethod
-    def of(cls, windows: Windows, safe: Bools, automaton: Automaton, labels: Labels) -> Play:
-        return cls(windows, safe, automaton, *leads_of(automaton, labels))
-
-    def entered(self, q: int, won: Any) -> Bools:
-        """(cells,): entered in state q, every reading wins."""
-        return entered(self.leads[q], self.kind, self.safe, won)
 
 
 class Least(Protocol):
@@ -97,7 +76,7 @@ def product(
     values and bits have one more axis, the automaton's states; values are the steps until it accepts. by: what solves the
     inner fixpoint, by default the compiled lists.
     """
-    game = (by or Watched)(Play.of(windows, safe, automaton, labels))
+    game = (by or Watched)(Play(windows, safe, automaton, *leads_of(automaton, labels)))
     won = np.broadcast_to(safe, (len(automaton.after), len(safe)))
     rounds = 0
     while True:
@@ -130,14 +109,6 @@ def leads_of(automaton: Automaton, labels: Labels) -> tuple[Bools, Ints]:
     return leads, kind
 
 
-def entered(leads: Bools, kind: Ints, safe: Bools, won: Bools) -> Bools:
-    """(cells,): entered in the state whose leads these are, every reading wins."""
-    good: Bools = safe & ~leads[:, -1][kind]
-    for t in np.flatnonzero(leads[:, :-1].any(axis=0)):
-        good &= ~leads[:, t][kind] | won[t]
-    return np.asarray(good)
-
-
 def missed(leads: Bools, kind: Ints, safe: Bools) -> npt.NDArray[np.int16]:
     """(states, cells): how many positions entering a cell may lead to; more than there are where it must not be entered."""
     never = 2 * len(leads)
@@ -161,12 +132,9 @@ class Watched:
 
     def __init__(self, play: Play) -> None:
         self.play, self.windows, self.safe = play, play.windows, play.safe
-        states, n = len(play.leads), self.windows.grid.size
-        self.values = np.empty((states, n), dtype=np.int32)
-        # What pairs of a position and an input can be numbered with.
-        self.number = np.int32 if states * n * self.windows.inputs < 1 << 31 else np.int64
-        self.repeats = inverse(self.windows, self.number)
-        self.bits = np.stack([solvers._no_bits(self.windows)] * states)
+        shape = len(play.leads), self.windows.grid.size
+        self.values, self.bits = np.empty(shape, dtype=np.int32), np.stack([self.windows.no_bits] * len(play.leads))
+        self.repeats = repeats.inverse(self.windows, whole(self.values.size * self.windows.inputs))
 
     def least(self, assumed: Bools) -> int:
         """The least fixpoint where accepting states lead to `assumed`; the largest value."""
@@ -174,50 +142,17 @@ class Watched:
         accepting, done = np.array(automaton.accepting), automaton.done
         self.values[:], self.bits[:] = np.where(self.safe, -1, -2), 0
         for q in np.flatnonzero(accepting).tolist():
-            self.bits[q] = self._every() if done[q] else self._again(q, assumed)
+            self.bits[q] = self.windows.offered(self.safe) if done[q] else self._again(q, assumed)
             self.values[q] = np.where(self.safe if done[q] else self.bits[q].any(axis=1), 0, -2)
-        missing = missed(leads, kind, self.safe)
-        top = self._watched(missing, ~accepting) if self.repeats is None else self._repeated(missing, ~accepting)
+        missing, good = missed(leads, kind, self.safe), np.full(self.values.shape, -1, dtype=np.int32)
+        on = reach.Positions(leads, kind, ~accepting, self.values, self.bits, good, missing)
+        if self.repeats is None:
+            reach.least(self.windows.game, on)
+        else:
+            inverse.least(self.repeats, on, self.windows.permitted)
         np.maximum(self.values, -1, out=self.values)
-        return int(top)
-
-    def _repeated(self, missing: Any, active: Bools) -> int:
-        assert self.repeats is not None
-        state, own = np.full(missing.shape, LOST, np.uint8), states(self.values)
-        state[missing < 2 * len(missing)] = OPEN
-        flat = self.bits.reshape(own.size, -1)
-        found = Found(state.ravel(), own.ravel(), self.values.ravel(), flat, solvers._allowed(self.windows))
-        nodes = np.empty((NODES, 4), self.number)
-        play = self.play
-        return int(repeated(self.repeats, play.leads, play.kind, missing, found, state, active, nodes))
-
-    def _watched(self, missing: Any, active: Bools) -> int:
-        states, n = self.values.shape
-        allowed, following = solvers._allowed(self.windows), (states, n * self.windows.inputs if active.any() else 0)
-        return int(
-            least(
-                *solvers._given(self.windows),
-                self.play.leads,
-                self.play.kind,
-                missing,
-                self.values,
-                np.full((states, n), -1, dtype=np.int32),
-                self.bits,
-                allowed,
-                active,
-                np.full((states, n), -1, dtype=self.number),
-                np.empty(following, dtype=self.number),
-            )
-        )
+        return int(self.values.max(initial=0))
 
     def _again(self, q: int, assumed: Bools) -> Any:
         """Inputs that lead from an accepting state to what is assumed."""
         return leading(self.windows, self.play.entered(q, assumed), self.safe & assumed[q])
-
-    def _every(self) -> Any:
-        """All inputs that are allowed, in safe cells."""
-        bits = solvers._no_bits(self.windows)
-        bits[self.safe] = np.packbits(np.ones(self.windows.inputs, dtype=bool))
-        if self.windows.allowed is not None:
-            bits[self.safe] = np.packbits(self.windows.allowed[self.safe], axis=1)
-        return bits

@@ -3,105 +3,72 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from gapcert import Box, Region
 from gapcert.plugin import Bools, Ints
 from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
-from gapcert_symbolic.kernels import kernels
-from gapcert_symbolic.solvers import solvers
-from gapcert_symbolic.solvers.solvers import Compiled, Fixpoints, Solution
+from gapcert_symbolic.kernels.kernels import Bits
+from gapcert_symbolic.solvers import runs
+from gapcert_symbolic.solvers.problem import Problem, Solution
+from gapcert_symbolic.solvers.solvers import solve
 
 CHUNK = 200_000
-ALONE = Compiled()
 
 
-@kernels.compiled
-def _lead(counts: Ints, wraps: Bools, packed: Any, values: kernels.Values, asked: Bools, allowed: Bools, bits: Any) -> None:
-    strides, m = kernels._strides(counts), packed[5].shape[1]
-    index, a, b, c = np.zeros((4, len(counts)), np.int64)
-    for i in range(len(values)):
-        if asked[i]:
-            for j in range(m):
-                if (not allowed.size or allowed[i, j]) and kernels._valid(
-                    counts, wraps, packed, strides, values, index, j, a, b, c
-                ):
-                    kernels._keep(bits, i, j)
-        kernels._next(counts, index)
-
-
-def leading(windows: Windows, into: Bools, asked: Bools) -> npt.NDArray[np.uint8]:
+def leading(windows: Windows, into: Bools, asked: Bools) -> Bits:
     """Per cell that is asked for, all inputs that lead wholly into the cells `into`; packed."""
-    bits = solvers._no_bits(windows)
-    values = np.where(into, 0, -1).astype(np.int32)
-    _lead(*solvers._given(windows), values, asked, solvers._allowed(windows), bits)
+    own, after = (np.where(on, 0, -1).astype(np.int32) for on in (asked, into))
+    bits = windows.no_bits
+    runs.leading(windows.game, after, own, bits)
     return bits
 
 
-@kernels.compiled
-def _remain(counts: Ints, wraps: Bools, packed: Any, values: kernels.Values, cells: Ints, allowed: Bools) -> None:
-    strides, m, sweeps, lost = kernels._strides(counts), packed[5].shape[1], 0, True
-    index, a, b, c = np.zeros((4, len(counts)), np.int64)
-    witness = np.zeros(len(cells), np.int64)
-    while lost:
-        lost = False
-        for t in range(len(cells)):
-            at = t if sweeps % 2 == 0 else len(cells) - 1 - t
-            i, j = cells[at], witness[at]
-            if values[i] == 0:
-                kernels._unravel(strides, i, index)
-                # What led out of a larger set leads out of a smaller one.
-                while j < m and not (
-                    (not allowed.size or allowed[i, j])
-                    and kernels._valid(counts, wraps, packed, strides, values, index, j, a, b, c)
-                ):
-                    j += 1
-                witness[at] = j
-                if j == m:
-                    values[i], lost = -1, True
-        sweeps += 1
+def remaining(problem: Problem, won: Bools, some: Bools) -> tuple[Bools, Bits]:
+    """νY. some ∩ Pre(won ∪ Y): of some cells, those from which one can remain among them until one comes to what is won; and
+    the inputs that do so.
+    """
+    windows, alive = problem.windows(), np.where(some, 0, np.where(won, 1, -1)).astype(np.int32)
+    bits = windows.no_bits
+    runs.invariance(problem.threads, windows.game, alive, bits, *windows.rows)
+    return alive == 0, bits
 
 
-def remaining(windows: Windows, won: Bools, some: Bools) -> Bools:
-    """νY. some ∩ Pre(won ∪ Y): of some cells, those from which one can remain among them until one comes to what is won."""
-    values, cells = np.where(won | some, 0, -1).astype(np.int32), np.flatnonzero(some)
-    _remain(*solvers._given(windows), values, cells, solvers._allowed(windows))
-    return np.asarray(some & (values == 0))
-
-
-def reach_and_stay(windows: Windows, safe: Bools, target: Bools, by: Fixpoints = ALONE) -> Solution:
+def reach_and_stay(problem: Problem, target: Bools) -> Solution:
     """μX. νY. Pre(X) ∪ (target ∩ Pre(X ∪ Y)), in `safe`: the state is outside the target finitely often.
 
     First the largest part of the target that can be kept for ever, at 0, and the steps to it. Then the cells of the target
     from which one either remains among them or comes to what is won by then: at one lasting value, greater than all so far;
     and the steps to these. So at a lasting value a step leads to no greater one, at others to a smaller one.
     """
-    kept = by.invariance(windows, safe & target)
+    safe = problem.safe
+    kept = solve(replace(problem, safe=safe & target))
     fresh, values, bits, rounds = kept.values >= 0, np.full(len(safe), -1, dtype=np.int32), kept.bits, kept.rounds
     lasting = list[int]()
     while fresh.any():
         level = int(values.max()) + 1
         lasting.append(level)
         values[fresh] = level
-        way = by.reach_avoid(windows, safe, values >= 0)
+        way = solve(replace(problem, target=values >= 0))
         later = way.values > 0
         values[later] = level + way.values[later]
         bits, rounds = np.where(later[:, None], way.bits, bits), rounds + way.rounds
         won = values >= 0
-        fresh = remaining(windows, won, safe & target & ~won)
-        bits = np.where(fresh[:, None], leading(windows, won | fresh, fresh), bits)
+        fresh, own = remaining(problem, won, safe & target & ~won)
+        bits = np.where(fresh[:, None], own, bits)
     return Solution(values, bits, rounds, tuple(lasting) or (0,))
 
 
-def recurrence(windows: Windows, safe: Bools, target: Bools, by: Fixpoints = ALONE) -> Solution:
+def recurrence(problem: Problem, target: Bools) -> Solution:
     """νZ μX. (target ∩ Pre(Z)) ∪ Pre(X): steps to the next visit, and in the target the inputs from which another follows."""
-    visits, rounds = safe & target, 0
+    windows, safe, rounds = problem.windows(), problem.safe, 0
+    visits = safe & target
     while True:
-        way = by.reach_avoid(windows, safe, visits)
+        way = solve(replace(problem, safe=safe, target=visits))
         safe, rounds = way.values >= 0, rounds + way.rounds
         again = leading(windows, safe, visits)
         left = visits & again.any(axis=1)

@@ -17,12 +17,12 @@ from gapcert import Goal
 from gapcert.plugin import Automaton, Bools, Ints
 from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
-from gapcert_symbolic.kernels import tree_kernels, tree_positions
-from gapcert_symbolic.solvers.solvers import Solution
+from gapcert_symbolic.kernels import reach, sets
+from gapcert_symbolic.solvers.problem import Solution, entered
 
-from .automata import Labels, entered, leads_of, missed, started
+from .automata import Labels, leads_of, missed, started
 from .games import inside, touching
-from .refinement import Level, Offer, Refined, Tree
+from .refinement import Level, Refined, Tree
 
 
 @final
@@ -55,10 +55,10 @@ class _Positions:
             for q in np.flatnonzero(~np.array(self.automaton.accepting)).tolist():
                 marks = _possible(leads[q], kind, may).astype(np.uint8)
                 known = marks[last] > 0
-                tree_kernels.hopeful(game, asked, marks, 0)
+                sets.hopeful(game, asked, marks, 0)
                 own = may[q, last]
                 own |= (marks[last] > 0) & ~known
-                own |= tree_positions.meeting(game, asked & known & ~own, marks)
+                own |= sets.meeting(game, asked & known & ~own, marks)
         split = (may & ~won)[:, last].any(axis=0)
         for q in range(len(may)):
             split |= _in_part(leads[q], kind, self.safe, won, may)[last]
@@ -74,10 +74,10 @@ class _Positions:
         self.safe = np.append(self.safe, self._safe())
         self.labels = self.labels.followed_by(self._labels())
 
-    def solve(self, windows: Windows, allowed: Bools | None) -> int:
+    def solve(self, windows: Windows) -> int:
         """The game on the last level, given what is won; the number of rounds."""
-        tree, none = self.tree, np.empty((0, 0), dtype=bool)
-        level = Level(tree.game(windows), tree.near(windows), none if allowed is None else allowed, windows.inputs)
+        tree = self.tree
+        level = Level(windows, tree.game(windows), tree.near(windows))
         given = self.values >= 0
         free = self.safe & ~given
         free[:, : tree.start] = False
@@ -99,32 +99,16 @@ class _Positions:
         for q in np.flatnonzero(accepting).tolist():
             own = free[q, last] & assumed[q, last]
             if done[q]:
-                found = level.every()
+                found = level.windows.offered(own)
             else:
                 into = np.where(entered(leads[q], kind, self.safe, assumed), 0, -1).astype(np.int32)
                 found = level.leading(into, own)
             wins = own if done[q] else own & found.any(axis=1)
             values[q, last][free[q, last]] = -2
             values[q, last][wins], bits[q][wins] = 0, found[wins]
-        pairs = len(tree.flat) * level.inputs
-        whole = np.int32 if len(values) * pairs < 2**31 else np.int64
-        due = np.flatnonzero((values >= 0) & (tree.first == 0))
-        due = due[np.argsort(values.ravel()[due], kind="stable")]
-        top = tree_positions.least(
-            level.game,
-            leads,
-            kind,
-            missed(leads, kind, self.safe),
-            values,
-            np.full(values.shape, -1, dtype=np.int32),
-            bits,
-            level.allowed,
-            ~accepting,
-            np.full(values.shape, -1, whole),
-            np.empty((len(values), pairs), whole),
-            due,
-        )
-        return np.maximum(values, -1), bits, int(top)
+        good, missing = np.full(values.shape, -1, dtype=np.int32), missed(leads, kind, self.safe)
+        reach.least(level.game, reach.Positions(leads, kind, ~accepting, values, bits, good, missing))
+        return np.maximum(values, -1), bits, int(values.max(initial=0))
 
     def facts(self) -> dict[str, Any]:
         """As those of a tree; cells win with the memory that a run begins with there."""
@@ -153,7 +137,7 @@ def _in_part(leads: Bools, kind: Ints, safe: Bools, won: Bools, may: Bools) -> B
 
 
 def refined_product(
-    goal: Goal, levels: int, coarse: Solution, windows: Windows, finer: Callable[[Grid, Ints], Windows], offer: Offer
+    goal: Goal, levels: int, coarse: Solution, windows: Windows, finer: Callable[[Grid, Ints], Windows]
 ) -> Refined:
     """As `refinement.refined`; values and bits have one more axis, the automaton's states."""
     assert goal.automaton is not None
@@ -166,7 +150,7 @@ def refined_product(
             break
         found.halve(split, windows.inputs)
         made.append(finer(tree.grid, tree.flat))
-        rounds += found.solve(made[-1], offer(tree.grid, tree.flat))
+        rounds += found.solve(made[-1])
         facts.append(found.facts())
     # Runs are in the parts of a node that is halved, and never in the node.
     found.values[:, tree.first > 0], found.bits[:, tree.first > 0] = -1, 0

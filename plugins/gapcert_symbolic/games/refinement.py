@@ -16,16 +16,15 @@ import numpy as np
 
 from gapcert import Goal, UsageError
 from gapcert.plugin import Bools, Ints
-from gapcert_cells import Along, Splits, Successors, SuccessorsByLevel
-from gapcert_symbolic.cells.abstraction import BYTES, MEMORY, Axis, Windows
+from gapcert_cells import Splits, SuccessorsByLevel
+from gapcert_symbolic.cells.abstraction import BYTES, MEMORY, Windows
 from gapcert_symbolic.cells.grid import Grid
-from gapcert_symbolic.kernels import tree_kernels
-from gapcert_symbolic.solvers.solvers import Solution
+from gapcert_symbolic.kernels import reach, sets
+from gapcert_symbolic.kernels.kernels import Game
+from gapcert_symbolic.solvers.problem import Solution
 
 from .automata import Labels
 from .games import inside, touching
-
-Offer = Callable[[Grid, Ints], Bools | None]
 
 
 @final
@@ -43,13 +42,7 @@ class Refined(NamedTuple):
     wins: Bools | None = None
 
     def promised(self) -> SuccessorsByLevel | None:
-        made = tuple(
-            Successors(
-                w.grid.counts, w.grid.wraps, tuple(Along(a.on, a.moves, a.column, a.first, a.last, a.row) for a in w.axes)
-            )
-            for w in self.windows
-        )
-        return SuccessorsByLevel(self.splits, made).unless_large()
+        return SuccessorsByLevel(self.splits, tuple(w.successors for w in self.windows)).unless_large()
 
     def won(self, least: int = 0) -> int:
         """Cells of at least this value."""
@@ -76,27 +69,17 @@ class Tree:
         self.first = np.zeros(grid.size, dtype=np.int64)
         self.values, self.bits, self.lasting = coarse.values.astype(np.int32), coarse.bits, list(coarse.lasting)
 
-    def game(self, windows: Windows) -> tree_kernels.Game:
-        axes, counts, wraps = windows.axes, np.array(windows.grid.counts), np.array(windows.grid.wraps)
-        first, last = (np.concatenate([getattr(a, end).ravel() for a in axes]) for end in ("first", "last"))
-        start = np.cumsum([0, *(a.first.size for a in axes)])[:-1]
-        width, moves = np.array([a.first.shape[1] for a in axes]), np.array([a.moves for a in axes])
-        column, rows = np.stack([a.column for a in axes]), np.stack([self._rows(a) for a in axes])
-        tables = first, last, start, width, moves, column, rows
-        return tree_kernels.Game(np.array(self.roots), self.level, self.first, counts, wraps, tables, self.start, self.flat)
-
-    def _rows(self, axis: Axis) -> Ints:
-        """The row of the axis for each node of the last level."""
-        if axis.row is not None:
-            return axis.row
-        index, counts = np.unravel_index(self.flat, self.grid.counts), [self.grid.counts[d] for d in axis.on]
-        return np.asarray(np.ravel_multi_index([index[d] for d in axis.on], counts) if axis.on else 0 * self.flat)
+    def game(self, windows: Windows) -> Game:
+        return windows.game._replace(
+            size=len(self.flat), level=self.level, children=self.first, start=self.start, flat=self.flat
+        )
 
     def near(self, windows: Windows) -> Ints:
         """(2, axes): least first and largest last cell of the windows of the last level's nodes, counted from the own index."""
         index, out = np.unravel_index(self.flat, self.grid.counts), []
         for k, axis in enumerate(windows.axes):
-            row, own = self._rows(axis), 0 if axis.moves else index[k]
+            row = axis.rows(index, self.grid.counts, np.arange(len(self.flat)))
+            own = 0 if axis.moves else index[k]
             least, most = axis.first.min(axis=1)[row] - own, axis.last.max(axis=1)[row] - own
             out.append([least.min(), most.max()])
         return np.array(out, dtype=np.int64).T.copy()
@@ -115,12 +98,12 @@ class Tree:
             own = marks[self.start :]
             own[goals] = 1
             if goal.kind in ("invariance", "reach_and_stay"):
-                tree_kernels.hopeful(game, goals, marks, 1)
+                sets.hopeful(game, goals, marks, 1)
             if goal.kind != "invariance":
-                tree_kernels.hopeful(game, asked, marks, 0)
+                sets.hopeful(game, asked, marks, 0)
             if goal.kind != "recurrence":
                 return np.asarray(asked & (own > 0))
-            tree_kernels.hopeful(game, asked, marks, 1)
+            sets.hopeful(game, asked, marks, 1)
             before, goals = goals, goals & (own > 0)
             if goals.sum() == before.sum():
                 return np.asarray(asked & (own > 0))
@@ -145,19 +128,18 @@ class Tree:
         self.values = np.append(self.values, np.full(new, -1, dtype=np.int32))
         self.bits = np.append(self.bits, np.zeros((new, self.bits.shape[1]), dtype=np.uint8), axis=0)
 
-    def solve(self, windows: Windows, goal: Goal, allowed: Bools | None) -> int:
+    def solve(self, windows: Windows, goal: Goal) -> int:
         """The game on the last level; the number of rounds."""
         safe = np.ones(len(self.flat), dtype=bool)
         if goal.avoid is not None:
             safe &= ~touching(self.grid, goal.avoid, self.flat)
         target = safe if goal.target is None else safe & inside(self.grid, goal.target, self.flat)
-        offered = np.empty((0, 0), dtype=bool) if allowed is None else allowed
-        level = Level(self.game(windows), self.near(windows), offered, windows.inputs)
+        level = Level(windows, self.game(windows), self.near(windows))
         own, bits = self.values[self.start :], self.bits[self.start :]
         if goal.kind == "recurrence":
             return self._recurrence(level, safe, target)
         if goal.kind == "reach_avoid":
-            own[target], bits[target] = 0, level.every()[target]
+            own[target], bits[target] = 0, windows.offered(target)[target]
             return level.reach(self.values, safe, bits)
         # What leads to where the target is kept for ever is kept for ever, too; for invariance that is all.
         rounds = level.remain(target, self.values == 0, own, bits, 0)
@@ -209,17 +191,11 @@ class Tree:
 
 @final
 class Level(NamedTuple):
-    """The last level as the compiled functions see it. allowed (its nodes, inputs): empty where all are."""
+    """The last level, with its windows as the compiled functions see them. near: as in `sets.invariance`."""
 
-    game: tree_kernels.Game
+    windows: Windows
+    game: Game
     near: Ints
-    allowed: Bools
-    inputs: int
-
-    def every(self) -> Any:
-        """All inputs that are allowed, per node."""
-        whole = np.ones((len(self.game.flat), self.inputs), dtype=bool)
-        return np.packbits(self.allowed if self.allowed.size else whole, axis=1)
 
     def remain(self, some: Bools, won: Bools, own: Any, bits: Any, value: int) -> int:
         """Those of some nodes from which one can remain among them, or come to what is won, get the value and such inputs."""
@@ -227,32 +203,27 @@ class Level(NamedTuple):
             return 0
         values = np.where(won, 1, -1).astype(np.int32)
         values[self.game.start :][some] = 0
-        rounds = tree_kernels.invariance(self.game, values, bits, self.allowed, self.near)
+        rounds = sets.invariance(self.game, values, bits, self.near)
         own[values[self.game.start :] == 0] = value
         return int(rounds)
 
     def leading(self, values: Any, asked: Bools) -> Any:
         """Per node that is asked for, all inputs that lead into what is won."""
-        bits = np.zeros((len(asked), (self.inputs + 7) // 8), dtype=np.uint8)
-        tree_kernels.leading(self.game, values, asked, bits, self.allowed, self.near)
+        bits = np.zeros((len(asked), self.windows.every.shape[1]), dtype=np.uint8)
+        sets.leading(self.game, values, asked, bits)
         return bits
 
     def reach(self, values: Any, safe: Bools, bits: Any) -> int:
         """Steps of safe nodes of the level to what is won, of which its own nodes have value 0, into values."""
         own = values[self.game.start :]
         own[~safe & (own < 0)] = -2
-        pairs, given = len(own) * self.inputs, int(values.max(initial=-1)) + 1
-        whole = np.int32 if pairs < 2**31 else np.int64
-        lists = np.full(len(own), -1, whole), np.full(given, -1, whole), np.empty(pairs, whole)
-        rounds = tree_kernels.reach(self.game, values, bits, self.allowed, lists)
+        reach.reach(self.game, values, bits)
         np.maximum(own, -1, out=own)
-        return int(rounds)
+        return int(own.max(initial=0))
 
 
-def refined(
-    goal: Goal, levels: int, coarse: Solution, windows: Windows, finer: Callable[[Grid, Ints], Windows], offer: Offer
-) -> Refined:
-    """From a solution on a grid, with its windows, to one on at most so many further levels. offer: the inputs of cells."""
+def refined(goal: Goal, levels: int, coarse: Solution, windows: Windows, finer: Callable[[Grid, Ints], Windows]) -> Refined:
+    """From a solution on a grid, with its windows, to one on at most so many further levels. finer: windows of some cells."""
     tree, made, rounds = Tree(windows.grid, coarse), [windows], coarse.rounds
     facts = [tree.facts()]
     for _ in range(levels):
@@ -261,7 +232,7 @@ def refined(
             break
         tree.halve(split, windows.inputs)
         made.append(finer(tree.grid, tree.flat))
-        rounds += tree.solve(made[-1], goal, offer(tree.grid, tree.flat))
+        rounds += tree.solve(made[-1], goal)
         facts.append(tree.facts())
     won = 0.0
     for k, fact in enumerate(facts):

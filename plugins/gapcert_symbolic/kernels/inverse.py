@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from gapcert.plugin import Bools, Ints, compiler
-from gapcert_symbolic.cells.abstraction import Windows
-from gapcert_symbolic.cells.repeats import Inverse, inverse
+from gapcert_symbolic.cells.repeats import Inverse
 
 from .kernels import Bits, Values, _keep, _unravel, borrowing, together
+from .reach import Positions, _spread
 
 States = npt.NDArray[np.uint8]
 LOST, OPEN, FRESH, WON = 0, 1, 2, 3  # FRESH: won in this round
@@ -169,7 +170,8 @@ def _round(
     number: int,
     part: Any,
 ) -> tuple[int, int]:
-    """As `kernels._round`, for won[begin:]; how many of `won` were done before nodes ran out, and the number in `later`.
+    """What is watched at won[begin:] or hangs there wins at `level`, or hangs on another cell then; how many of `won` were done
+    before nodes ran out, and the number in `later`.
 
     part: of how many threads this is which one; stripes of 2^stripe cells go to them in turn; and the ends of `back`.
     """
@@ -195,41 +197,46 @@ def _round(
     return len(won), number
 
 
-def _levels(parts: int, given: Inverse, found: Found, won: Any, later: Any, nodes: Any, stripes: Any) -> int:
-    """As `kernels.reach`. won: room for all cells. later, nodes: per thread, room for its cells, and (n, 4), made longer.
+def fixpoint(given: Inverse, found: Found, threads: int = 1, entered: Callable[[Any], Any] | None = None) -> None:
+    """Values and inputs of all positions that can be won, in the fewest steps. entered: of positions that are won, those that
+    can be entered now, where an automaton makes the difference.
 
     A thread has the pairs of its own cells: it alone changes what is known of these, and hangs them on lists of its own. Who
     is won is told to all after the round, so nothing depends on the number of threads.
     """
-    targets = np.flatnonzero(found.own == WON)
-    number, level = len(targets), 0
-    won[:number] = targets
-    head, room = np.full((parts, len(found.state)), -1, nodes.dtype), np.zeros((parts, APART + len(given.counts)), np.int64)
+    size, kind = len(found.state), given.back.dtype
+    low, high = int(given.back.min(initial=0)), int(given.back.max(initial=0))
+    stripe = max(6, (STRIPE * (high - low)).bit_length())
+    later = np.empty((threads, (1 << stripe) * -(-size // (threads << stripe))), kind)
+    won, nodes, level = np.empty(size, kind), np.empty((threads, NODES, 4), kind), 0
+    head, room = np.full((threads, size), -1, kind), np.zeros((threads, APART + len(given.counts)), np.int64)
     room[:, 0] = -1
-    done, fresh = [0] * parts, [0] * parts
-    own = [(Lists(head[t], nodes[t], room[t, :2], room[t, APART:]), later[t], (parts, t, *stripes)) for t in range(parts)]
+    lists = [Lists(head[t], nodes[t], room[t, :2], room[t, APART:]) for t in range(threads)]
+    done, fresh = [0] * threads, [0] * threads
 
     def work(t: int) -> None:
-        lists, new, part = own[t]
-        done[t], fresh[t] = _round(given, found, lists, level, ready, new, done[t], fresh[t], part)
+        part = threads, t, stripe, low, high
+        done[t], fresh[t] = _round(given, found, lists[t], level, ready, later[t], done[t], fresh[t], part)
 
-    with together(parts) as each:
-        while number:
-            level, ready = level + 1, won[:number]
-            done[:], fresh[:] = [0] * parts, [0] * parts
+    ready = np.flatnonzero(found.own == WON).astype(kind)
+    with together(threads) as each:
+        while len(ready):
+            ready = ready if entered is None else entered(ready)
+            level += 1
+            done[:], fresh[:] = [0] * threads, [0] * threads
             each(work)
-            while min(done) < number:
-                longer = np.empty((parts, nodes.shape[1] * 3 // 2 + len(given.back), 4), nodes.dtype)
+            while min(done) < len(ready):
+                longer = np.empty((threads, nodes.shape[1] * 3 // 2 + len(given.back), 4), kind)
                 longer[:, : nodes.shape[1]] = nodes
                 nodes = longer
-                own = [(lists._replace(nodes=nodes[t]), *rest) for t, (lists, *rest) in enumerate(own)]
+                lists = [own._replace(nodes=nodes[t]) for t, own in enumerate(lists)]
                 each(work)
             number = 0
-            for t in range(parts):
+            for t in range(threads):
                 new = later[t, : fresh[t]]
                 found.own[new], won[number : number + len(new)] = WON, new
                 number += len(new)
-    return max(level - 1, 0)
+            ready = won[:number]
 
 
 def states(values: Values) -> States:
@@ -239,16 +246,16 @@ def states(values: Values) -> States:
     return out
 
 
-def reach(windows: Windows, values: Values, bits: Bits, allowed: Bools, threads: int = 1) -> int | None:
-    """As `kernels.reach`; None, and nothing done, where windows do not repeat."""
-    whole = np.int32 if windows.grid.size * windows.inputs < 2**31 else np.int64
-    if (made := inverse(windows, whole)) is None:
-        return None
+def reach(given: Inverse, values: Values, bits: Bits, allowed: Bools, threads: int = 1) -> None:
+    """As `reach.reach`."""
     state = states(values)
-    low, high = int(made.back.min(initial=0)), int(made.back.max(initial=0))
-    stripe = max(6, (STRIPE * (high - low)).bit_length())
-    size = 1 << stripe
-    later = np.empty((threads, size * -(-len(values) // (size * threads))), whole)
-    won, nodes = np.empty(len(values), whole), np.empty((threads, NODES, 4), whole)
-    found = Found(state, state, values, bits, allowed)
-    return _levels(threads, made, found, won, later, nodes, (stripe, low, high))
+    fixpoint(given, Found(state, state, values, bits, allowed), threads)
+
+
+def least(given: Inverse, on: Positions, allowed: Bools) -> None:
+    """As `reach.least`."""
+    state, own = np.full(on.missing.shape, LOST, np.uint8), states(on.values)
+    state[on.missing < 2 * len(on.missing)] = OPEN
+    fresh, on = np.empty(state.size, given.back.dtype), on._replace(good=state)
+    found = Found(state.ravel(), own.ravel(), on.values.ravel(), on.bits.reshape(own.size, -1), allowed)
+    fixpoint(given, found, 1, lambda won: fresh[: _spread(on, WON, won, fresh)])

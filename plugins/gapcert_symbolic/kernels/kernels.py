@@ -1,7 +1,6 @@
-"""Reach over windows of cells, compiled: by watched successors.
+"""Cells and their windows as compiled functions see them, and what all of these functions use.
 
-`packed` are the tables of windows (`abstraction.Windows.packed`); cells are numbered in C order. Values are 0 or more for cells
-that are won, and negative for others.
+Cells are numbered in C order. Values are 0 or more for cells that are won, −1 for cells that may be, and less for others.
 """
 
 from __future__ import annotations
@@ -9,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -18,11 +17,48 @@ from gapcert.plugin import Bools, Ints, compiler
 
 Values = npt.NDArray[np.int32]
 Bits = npt.NDArray[np.uint8]
+Marks = npt.NDArray[np.uint8]
 
 compiled = compiler(nogil=True, error_model="numpy")
 # Put in by LLVM where it is called, and by compiled functions alone: called from Python it would crash.
 inlined = compiler(nogil=True, error_model="numpy", _nrt=False, forceinline=True, no_cpython_wrapper=True)
 _F = TypeVar("_F", bound=Callable[..., Any])
+
+
+class Packed(NamedTuple):
+    """The tables of windows of all axes in one. The entry of axis k, of cell i with these indices under input j, is at
+    start_k + Σ_d index_d strides_kd + column_kj, or where tables are for some cells only, at start_k + offset_ki + column_kj;
+    else offset is empty. Where an axis moves, entries count from the own index.
+    """
+
+    first: Values
+    last: Values
+    start: Ints
+    strides: Ints
+    offset: Ints
+    moves: Bools
+    column: Ints
+
+
+class Game(NamedTuple):
+    """The cells in play, so many (`size`), of a grid with so many along each axis; strides are in cells. allowed (cells,
+    inputs): empty where all are.
+
+    On a grid some cells of which are halved (`gapcert_cells.Splits`) they are those of the last level, number `level`: the
+    nodes start, start + 1, … with the numbers `flat` on their own grid. children: the first child of each node, or 0. Level 0
+    is a grid as it is, and needs neither.
+    """
+
+    counts: Ints
+    wraps: Bools
+    strides: Ints
+    packed: Packed
+    allowed: Bools
+    size: int
+    level: int
+    children: Ints
+    start: int
+    flat: Ints
 
 
 def borrowing(function: _F) -> _F:
@@ -50,6 +86,11 @@ def together(threads: int) -> Iterator[Callable[[Callable[[int], None]], object]
 def part(n: int, threads: int, own: int) -> tuple[int, int]:
     """(begin, end) of a thread's own part of 0 … n − 1."""
     return own * n // threads, (own + 1) * n // threads
+
+
+def whole(number: int) -> Any:
+    """The type of integers that so many are numbered with."""
+    return np.int32 if number < 2**31 else np.int64
 
 
 @compiled
@@ -101,42 +142,92 @@ def _range(count: int, wraps: bool, begin: int, end: int) -> tuple[int, int, boo
     return begin, end, begin >= 0 and end < count
 
 
-@borrowing
-def _window(counts: Ints, wraps: Bools, packed: Any, index: Ints, j: int, a: Ints, b: Ints) -> bool:
-    """First and last cell of each axis; False where the window leaves the grid. On an axis that wraps a is in the grid."""
-    first, last, start, strides, moves, column = packed
-    inside = True
-    for k in range(len(counts)):
-        at = start[k] + column[k, j]
-        for d in range(len(counts)):
-            at += index[d] * strides[k, d]
-        own = index[k] if moves[k] else 0
-        a[k], b[k], within = _range(counts[k], wraps[k], own + first[at], own + last[at])
+@inlined
+def _entry(packed: Any, i: int, index: Ints, k: int) -> int:
+    """Where the entries of axis k begin for a cell."""
+    if packed.offset.size:
+        return int(packed.start[k] + packed.offset[k, i])
+    at = packed.start[k]
+    for d in range(len(index)):
+        at += index[d] * packed.strides[k, d]
+    return int(at)
+
+
+@inlined
+def _ends(game: Any, i: int, index: Ints, j: int, axes: int, a: Ints, b: Ints) -> bool:
+    """First and last cell of a window along the first axes; False where it leaves the grid. Along one that wraps a is in it."""
+    packed, inside = game.packed, True
+    for k in range(axes):
+        at = _entry(packed, i, index, k) + packed.column[k, j]
+        own = index[k] if packed.moves[k] else 0
+        a[k], b[k], within = _range(game.counts[k], game.wraps[k], own + packed.first[at], own + packed.last[at])
         inside = inside and within
     return inside
 
 
-@borrowing
-def _advance(counts: Ints, strides: Ints, a: Ints, b: Ints, c: Ints, values: Values, level: int) -> int:
-    """From c on, the first cell of the window whose value is not in [0, level), or −1."""
-    n = len(counts) - 1
+@inlined
+def _window(game: Any, i: int, index: Ints, j: int, a: Ints, b: Ints) -> bool:
+    """First and last cell of a window; False where it leaves the grid."""
+    return _ends(game, i, index, j, len(game.counts), a, b)
+
+
+@inlined
+def _cell(game: Any, i: int, index: Ints) -> None:
+    """The indices of cell i in play."""
+    _unravel(game.strides, game.flat[i] if game.level else i, index)
+
+
+@inlined
+def _node(game: Any, c: Ints) -> tuple[int, int]:
+    """The whole node that holds the cell c of the last level, and how many levels above it lies."""
+    at, shift, counts = 0, game.level, game.counts
+    for k in range(len(c)):
+        i = c[k] if c[k] < counts[k] else c[k] - counts[k]
+        at = at * (counts[k] >> game.level) + (i >> shift)
+    while shift and game.children[at]:
+        shift -= 1
+        child = 0
+        for k in range(len(c)):
+            i = c[k] if c[k] < counts[k] else c[k] - counts[k]
+            child = 2 * child + ((i >> shift) & 1)
+        at = game.children[at] + child
+    return at, shift
+
+
+@inlined
+def _row(counts: Ints, strides: Ints, c: Ints) -> int:
+    """The first cell of the row of the last axis that c is in."""
+    row = 0
+    for k in range(len(c) - 1):
+        row += (c[k] if c[k] < counts[k] else c[k] - counts[k]) * strides[k]
+    return row
+
+
+@inlined
+def _skip(c: Ints, above: int) -> None:
+    """c moves on to the last cell of its row in a node so many levels above; counts are multiples of its width."""
+    c[len(c) - 1] |= (1 << above) - 1
+
+
+@inlined
+def _outside(game: Any, values: Values, level: int, work: Any) -> int:
+    """From c on, the first node of a window whose value is not in [0, level), or −1. work: its first and last cell, and c."""
+    a, b, c = work
+    n = len(c) - 1
     while True:
-        row = 0
-        for k in range(n):
-            row += (c[k] if c[k] < counts[k] else c[k] - counts[k]) * strides[k]
-        for z in range(c[n], b[n] + 1):
-            q = row + (z if z < counts[n] else z - counts[n])
+        if game.level:
+            q, above = _node(game, c)
             if values[q] < 0 or values[q] >= level:
                 return q
-        c[n] = a[n]
-        d = n - 1
-        while d >= 0:
-            c[d] += 1
-            if c[d] <= b[d]:
-                break
-            c[d] = a[d]
-            d -= 1
-        if d < 0:
+            _skip(c, above)
+        else:
+            row, count = _row(game.counts, game.strides, c), game.counts[n]
+            for z in range(c[n], b[n] + 1):
+                q = row + (z if z < count else z - count)
+                if values[q] < 0 or values[q] >= level:
+                    return q
+            c[n] = b[n]
+        if not _on(a, b, c, n + 1):
             return -1
 
 
@@ -146,129 +237,6 @@ def _keep(bits: Bits, i: int, j: int) -> None:
 
 
 @compiled
-def _watch(
-    counts: Ints,
-    wraps: Bools,
-    packed: Any,
-    values: Values,
-    bits: Bits,
-    allowed: Bools,
-    near: tuple[Ints, Ints],
-    head: Any,
-    following: Any,
-    won: Any,
-) -> int:
-    """Hang every pair on the first cell of its window that is not won; those that have none win, and their number is returned.
-
-    near: index ranges of the cells whose windows may touch cells that are won. won: their numbers.
-    """
-    strides, m, number = _strides(counts), packed[5].shape[1], 0
-    index, a, b, c = np.zeros((4, len(counts)), np.int64)
-    for i in range(len(values)):
-        if values[i] == -1:
-            close = True
-            for k in range(len(counts)):
-                close = close and near[0][k] <= index[k] <= near[1][k]
-            for j in range(m):
-                if (allowed.size and not allowed[i, j]) or not _window(counts, wraps, packed, index, j, a, b):
-                    continue
-                found = 0
-                for k in range(len(counts)):
-                    c[k] = a[k]
-                    found += a[k] * strides[k]
-                if close:
-                    found = _advance(counts, strides, a, b, c, values, 1)
-                if found < 0:
-                    _keep(bits, i, j)
-                    if values[i] == -1:
-                        values[i], won[number] = -3, i
-                        number += 1
-                else:
-                    following[i * m + j], head[found] = head[found], i * m + j
-        _next(counts, index)
-    for f in range(number):
-        values[won[f]] = 1
-    return number
-
-
-@compiled
-def _round(
-    counts: Ints,
-    wraps: Bools,
-    packed: Any,
-    values: Values,
-    bits: Bits,
-    level: int,
-    head: Any,
-    following: Any,
-    won: Any,
-    later: Any,
-) -> int:
-    """Of the pairs that hang on the cells `won`, those whose windows are won in fewer than `level` steps win; others hang on
-    another cell then. How many cells win, their numbers in `later`.
-    """
-    strides, m, number = _strides(counts), packed[5].shape[1], 0
-    index, a, b, c = np.zeros((4, len(counts)), np.int64)
-    for q in won:
-        pair = head[q]
-        while pair >= 0:
-            after, i = following[pair], pair // m
-            value = values[i]
-            # A cell that was won before has its inputs; one that is won in this round may get further ones.
-            if value == -1 or value == level:
-                j = pair - i * m
-                _unravel(strides, i, index)
-                _window(counts, wraps, packed, index, j, a, b)
-                _unravel(strides, q, c)
-                for k in range(len(counts)):
-                    if c[k] < a[k]:
-                        c[k] += counts[k]
-                found = _advance(counts, strides, a, b, c, values, level)
-                if found >= 0:
-                    following[pair], head[found] = head[found], pair
-                else:
-                    _keep(bits, i, j)
-                    if value == -1:
-                        values[i], later[number] = level, i
-                        number += 1
-            pair = after
-    return number
-
-
-@compiled
-def reach(
-    counts: Ints,
-    wraps: Bools,
-    packed: Any,
-    values: Values,
-    bits: Bits,
-    allowed: Bools,
-    near: tuple[Ints, Ints],
-    head: Any,
-    following: Any,
-) -> int:
-    """values: 0 for targets, −1 for cells to be won, less for others; changed, and bits filled. The largest value is returned.
-
-    Each pair of a cell and an input hangs on one successor that is not won yet: when that is won, the rest of the window is
-    looked through for another. So a window is passed once, and no transition is stored. head (cells,), −1 everywhere, and
-    following (pairs,) hold these lists: integers that can number all pairs.
-    """
-    won, later = np.empty(len(values), head.dtype), np.empty(len(values), head.dtype)
-    number, level = _watch(counts, wraps, packed, values, bits, allowed, near, head, following, won), 0
-    while number:
-        level += 1
-        number = _round(counts, wraps, packed, values, bits, level + 1, head, following, won[:number], later)
-        won, later = later, won
-    return level
-
-
-@borrowing
-def _valid(
-    counts: Ints, wraps: Bools, packed: Any, strides: Ints, values: Values, index: Ints, j: int, a: Ints, b: Ints, c: Ints
-) -> bool:
-    """Is the window inside the grid and won?"""
-    if not _window(counts, wraps, packed, index, j, a, b):
-        return False
-    for k in range(len(counts)):
-        c[k] = a[k]
-    return _advance(counts, strides, a, b, c, values, 1) < 0
+def _room(axes: int) -> Any:
+    """Room for an index, and for a window and a cell of it."""
+    return np.zeros(axes, np.int64), (np.zeros(axes, np.int64), np.zeros(axes, np.int64), np.zeros(axes, np.int64))

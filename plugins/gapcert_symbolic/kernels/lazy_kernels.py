@@ -14,10 +14,9 @@ import numpy.typing as npt
 from gapcert import Array
 from gapcert.plugin import Bools, Ints
 
-from .kernels import Bits, _on, _strides, borrowing, compiled, inlined
+from .kernels import Bits, Marks, _on, _row, _strides, borrowing, compiled, inlined
 
 Small = npt.NDArray[np.int32]
-Marks = npt.NDArray[np.uint8]
 FACTOR = 4  # parts of a block per axis
 SHIFT = 3
 SETTLED, WAITS, GONE = 0, 1, 2
@@ -71,15 +70,6 @@ class Watch(NamedTuple):
 
 
 @inlined
-def _rows(counts: Ints, strides: Ints, at: Ints) -> int:
-    """The first cell of the row `at` of a box, without what the last axis adds."""
-    row = 0
-    for k in range(len(counts) - 1):
-        row += (at[k] if at[k] < counts[k] else at[k] - counts[k]) * strides[k]
-    return row
-
-
-@inlined
 def _scan(cells: Any, work: Ints) -> int:
     """Are all, some or none of the cells of a box alive? An axis that wraps may go on beyond its end."""
     counts, n, low, high, at = cells.counts, len(cells.counts) - 1, work[0], work[1], work[2]
@@ -87,7 +77,7 @@ def _scan(cells: Any, work: Ints) -> int:
     for k in range(n):
         at[k] = low[k]
     while True:
-        row = _rows(counts, cells.strides, at)
+        row = _row(counts, cells.strides, at)
         for i in range(row + low[n], row + inner):
             some |= cells.alive[i]
             every &= cells.alive[i]
@@ -160,7 +150,7 @@ def _die(tree: Any, watch: Any, cells: Any, i: int, work: Ints) -> None:
     tree.state[i] = GONE
     _block(cells.counts, tree.corner[i], tree.size[i], work)
     while True:
-        row = _rows(cells.counts, cells.strides, at)
+        row = _row(cells.counts, cells.strides, at)
         cells.alive[row + low[n - 1] : row + high[n - 1] + 1] = 0
         if not _on(low, high, at, n - 1):
             break
@@ -259,7 +249,7 @@ def _offered(cells: Any, j: int, work: Ints) -> int:
     for k in range(n):
         at[k] = low[k]
     while True:
-        row = _rows(cells.counts, cells.strides, at)
+        row = _row(cells.counts, cells.strides, at)
         for i in range(row + low[n], row + high[n] + 1):
             if cells.alive[i]:
                 offered = j < 0 or cells.allowed[i, j]
@@ -351,7 +341,7 @@ def kept(tree: Any, cells: Any, blocks: int, size: int, bits: Bits, mine: Bits, 
             number += 1
         _block(cells.counts, tree.corner[i], size, work)
         while more:
-            row = _rows(cells.counts, cells.strides, at)
+            row = _row(cells.counts, cells.strides, at)
             _mark(bits, cells.alive, row + low[n], row + high[n] + 1, mine)
             more = _on(low, high, at, n)
     return number
@@ -369,7 +359,7 @@ def suprema(counts: Ints, cell: Ints, lo: Array, hi: Array, corner: Small, end: 
         at[:] = corner[i]
         more = True
         while more:
-            row = _rows(counts, strides, at)
+            row = _row(counts, strides, at)
             for c in range(row + corner[i, n], row + end[i, n] + 1):
                 # Cells that follow each other are mostly in the same part.
                 if cell[c] != before:

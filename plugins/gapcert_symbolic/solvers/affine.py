@@ -7,8 +7,7 @@ axis, and the cells whose windows hold a given one are those with β_jk · i in 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, final
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +19,9 @@ from gapcert_symbolic.cells.bounds import Bound, Grown
 from gapcert_symbolic.cells.gaps import Disturbance
 from gapcert_symbolic.cells.grid import Grid, corners
 from gapcert_symbolic.cells.structure import LEAK, ROUNDING
-from gapcert_symbolic.kernels.kernels import compiled, inlined
+from gapcert_symbolic.kernels.kernels import _on, compiled, inlined
+
+from .problem import Problem, Solution
 
 Bits = npt.NDArray[np.uint8]
 Marks = npt.NDArray[np.int8]
@@ -30,9 +31,7 @@ STRETCH = 256
 INPUTS = 64  # above, tables are shared by inputs and pay
 
 
-@final
-@dataclass(frozen=True)
-class Maps:
+class Maps(NamedTuple):
     """slope β (m, n, n), in cells per cell; low, high (m, n), of the first cell; inverse (m, n, n) = β⁻¹, of which an image in
     the grid errs by less than `spare` cells.
     """
@@ -42,6 +41,13 @@ class Maps:
     high: Array
     inverse: Array
     spare: float
+
+
+def solve(problem: Problem) -> Solution | None:
+    """Invariance, where f is affine under each of few inputs."""
+    if problem.target is not None or problem.dynamics is None or (found := maps(*problem.dynamics)) is None:
+        return None
+    return Solution(*invariance(found, problem.dynamics.grid, problem.safe), 1)
 
 
 def maps(bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance | None, allowed: Bools | None) -> Maps | None:
@@ -109,9 +115,9 @@ def invariance(found: Maps, grid: Grid, safe: Bools) -> tuple[Marks, Bits]:
     planes, counts = safe.view(np.uint8)[None], grid.counts
     if len(found.low) > 8:
         planes = np.empty(((len(found.low) + 7) // 8, grid.size), dtype=np.uint8)
-    _keep_inside(counts, found.slope, found.low, found.high, safe, planes)
+    _keep_inside(counts, found, safe, planes)
     dead = np.empty(grid.size, dtype=np.int32 if grid.size < 2**31 else np.int64)
-    _die(counts, found.slope, found.low, found.high, found.inverse, found.spare, planes, dead, _lost(planes, dead))
+    _die(counts, found, planes, dead, _lost(planes, dead))
     # One byte per cell is what a large grid has room for.
     values: Marks = np.asarray(planes.any(axis=0) if len(planes) > 1 else planes[0] > 0).view(np.int8)
     np.subtract(values, 1, out=values)
@@ -179,9 +185,9 @@ def _mark(plane: Bits, safe: Bools, value: np.uint8) -> None:
 
 
 @compiled
-def _keep_inside(counts: Counts, slope: Array, low: Array, high: Array, safe: Bools, planes: Bits) -> None:
+def _keep_inside(counts: Counts, maps: Any, safe: Bools, planes: Bits) -> None:
     """The inputs under which a safe cell stays in the grid: ⌊low + β·i⌋ ≥ 0 and ⌊high + β·i⌋ < counts."""
-    n = len(counts)
+    slope, low, high, n = maps.slope, maps.low, maps.high, len(counts)
     rows, width = len(safe) // counts[n - 1], counts[n - 1]
     index, shift, none, ends = np.zeros(n, np.int64), np.empty(n), np.zeros(n), np.array(counts, np.float64)
     tail, own, nothing = slope[:, :, n - 1].copy(), np.empty(width, np.bool_), np.zeros(width, np.uint8)
@@ -237,22 +243,12 @@ def _lost(planes: Bits, dead: Any) -> int:
 
 
 @compiled
-def _die(
-    counts: Counts,
-    slope: Array,
-    low: Array,
-    high: Array,
-    inverse: Array,
-    spare: float,
-    planes: Bits,
-    dead: Any,
-    number: int,
-) -> None:
+def _die(counts: Counts, maps: Any, planes: Bits, dead: Any, number: int) -> None:
     """Inputs that may lead to a dead cell are no longer valid, and cells without any die; until nothing changes.
 
     Dead cells that follow each other along the last axis are taken at once.
     """
-    n, done = len(counts), 0
+    (slope, low, high, inverse, spare), n, done = maps, len(counts), 0
     index, first, last, shift = np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n, np.int64), np.empty(n)
     begin, end, tail = np.zeros(n), np.zeros(n), slope[:, :, n - 1].copy()
     flip = 1 / tail
@@ -286,14 +282,7 @@ def _die(
                 for k in range(n - 1):
                     row = (row + index[k]) * counts[k + 1]
                 number = _lose(planes, row + own[0], row + own[1], j, dead, number)
-                d = n - 2
-                while d >= 0:
-                    index[d] += 1
-                    if index[d] <= last[d]:
-                        break
-                    index[d] = first[d]
-                    d -= 1
-                some = d >= 0
+                some = _on(first, last, index, n - 1)
 
 
 @inlined

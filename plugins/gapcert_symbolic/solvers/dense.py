@@ -2,7 +2,7 @@
 
 A window holds no lost cell iff their number in it is 0, and that is a signed sum of 2ⁿ entries of a table of prefix sums
 (summed-area table). Sums are modulo 2³², which tells 0 apart in windows of fewer than 2³² cells. On an axis that wraps, the
-table goes around twice. Values and inputs are those of `solvers`, whose functions these are by name.
+table goes around twice. Values and inputs are those of the compiled solvers.
 """
 
 from __future__ import annotations
@@ -18,9 +18,8 @@ import numpy as np
 from gapcert import MissingDependency
 from gapcert.plugin import Bools
 from gapcert_symbolic.cells.abstraction import Windows
-from gapcert_symbolic.games.automata import Play
 
-from .solvers import Solution
+from .problem import Play, Problem, Solution
 
 
 def check() -> None:
@@ -31,8 +30,15 @@ def check() -> None:
         )
 
 
-def invariance(windows: Windows, safe: Bools) -> Solution:
-    """As `solvers.invariance`."""
+def solve(problem: Problem) -> Solution | None:
+    """Either game, where the option asks for it."""
+    if problem.solver != "jax":
+        return None
+    windows, safe, target = problem.windows(), problem.safe, problem.target
+    return _invariance(windows, safe) if target is None else _reach_avoid(windows, safe, target)
+
+
+def _invariance(windows: Windows, safe: Bools) -> Solution:
     game = _Game(windows)
     alive, rounds = game.cells(safe), 0
     while True:
@@ -44,8 +50,7 @@ def invariance(windows: Windows, safe: Bools) -> Solution:
     return Solution(np.where(game.flat(alive), 0, -1).astype(np.int32), game.bits(inputs), rounds)
 
 
-def reach_avoid(windows: Windows, safe: Bools, target: Bools) -> Solution:
-    """As `solvers.reach_avoid`."""
+def _reach_avoid(windows: Windows, safe: Bools, target: Bools) -> Solution:
     game = _Game(windows)
     won, inputs = game.cells(target & safe), game.offered(target & safe)
     left, values, level = game.cells(safe & ~target), game.cells(np.where(target & safe, 0, -1).astype(np.int32)), 0
@@ -111,7 +116,7 @@ class _Game:
             [jnp.asarray(np.ascontiguousarray(end.T).reshape(end.shape[1], *shape)) for end in (axis.first, axis.last)]
             for axis, shape in zip(windows.axes, shapes, strict=True)
         ]
-        self.allowed = self._shaped(_all(windows))
+        self.allowed = self._shaped(windows.every)
         self._kept, self._grown = _compiled(grid.counts, grid.wraps, tuple(axis.moves for axis in windows.axes))
 
     def _shaped(self, packed: Any) -> Any:
@@ -143,12 +148,6 @@ class _Game:
 
     def grown(self, won: Any, left: Any, values: Any, inputs: Any, level: int) -> Any:
         return self._grown(won, left, values, inputs, np.int32(level), self.column, self.tables, self.allowed)
-
-
-def _all(windows: Windows) -> Any:
-    """What relations leave, packed: (cells, bytes), or (1, bytes) without relations."""
-    allowed = np.ones((1, windows.inputs), dtype=bool) if windows.allowed is None else windows.allowed
-    return np.packbits(allowed, axis=1)
 
 
 @functools.cache

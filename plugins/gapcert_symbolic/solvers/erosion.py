@@ -17,8 +17,11 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.plugin import Bools, Ints
-from gapcert_symbolic.cells.abstraction import Axis, Windows
+from gapcert_cells import Along
+from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.kernels.kernels import borrowing, compiled, inlined, part, together
+
+from .problem import Problem, Solution
 
 Words = npt.NDArray[np.uint64]
 ALL = np.uint64(2**64 - 1)
@@ -45,6 +48,14 @@ def order(windows: Windows) -> tuple[int, ...] | None:
         done.append(k)
         left.remove(k)
     return (*done, last)
+
+
+def solve(problem: Problem) -> Solution | None:
+    """Invariance, where axes can be eroded one after another."""
+    if problem.target is not None or (found := order(windows := problem.windows())) is None:
+        return None
+    alive, bits, rounds = invariance(windows, problem.safe, found, problem.threads)
+    return Solution(np.where(alive, 0, -1).astype(np.int32), bits, rounds)
 
 
 def invariance(windows: Windows, safe: Bools, order: tuple[int, ...], threads: int = 1) -> tuple[Bools, Bits, int]:
@@ -137,7 +148,7 @@ class _Layout:
         whole = rows.reshape(*self.counts, self.shape[self.along])
         return np.ascontiguousarray(np.moveaxis(whole, -1, self.along)).astype(bool).ravel()
 
-    def rows(self, windows: Windows, axis: Axis) -> Ints:
+    def rows(self, windows: Windows, axis: Along) -> Ints:
         """The row of the axis' table for each row of bits."""
         at = np.zeros(len(self.base), dtype=np.int64)
         for d in axis.on:

@@ -27,7 +27,7 @@ from gapcert_symbolic.kernels import lazy_kernels as kernels
 from gapcert_symbolic.kernels.kernels import Bits, _strides
 from gapcert_symbolic.kernels.lazy_kernels import Cells, Small, Tree, Watch
 
-from .solvers import Solution
+from .problem import Problem, Solution
 
 PARTS = 8  # blocks along the longest axis to begin with, or some more
 PAIRS = 400_000
@@ -84,14 +84,15 @@ class BlockWindows:
         return Interval(lo[block, of], hi[block, of])
 
 
-def solved(
-    bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance | None, allowed: Bools | None, safe: Bools
-) -> Solution | None:
-    """Invariance on safe cells; None where tables are as good, or blocks do not do."""
+def solve(problem: Problem) -> Solution | None:
+    """Invariance; None where tables are as good, or blocks do not do."""
+    if problem.target is not None or problem.dynamics is None:
+        return None
+    bound, grid, axes, added, allowed = problem.dynamics
     if not suits(bound, grid, axes):
         return None
     ask = BlockWindows(bound, grid, axes, added)
-    found, nested = invariance(ask, grid, safe, len(ask.points), allowed)
+    found, nested = invariance(ask, grid, problem.safe, len(ask.points), allowed)
     # A bound on trust that does not grow with the radius may have been meant for cells, and tell nothing of blocks.
     return found if nested or ask.spread is None else None
 
