@@ -233,7 +233,8 @@ def _predictor(choice: Any, samples: Samples, model: Model, domain: Domain) -> P
     if choice == "affine":
         return AffinePredictor.fit(samples)
     if callable(choice):
-        return choice(samples, domain)
+        made: Predictor = choice(samples, domain)
+        return made
     if choice == "none":
         return AffinePredictor.none(samples.r.shape[1], samples.z.shape[1])
     raise UsageError(
