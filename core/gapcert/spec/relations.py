@@ -13,11 +13,10 @@ from gapcert.spec.models import unknown_key
 from gapcert.spec.sections.areas import GoalConfig, in_units
 from gapcert.spec.sections.config import Config
 from gapcert.spec.sections.cuts import cut_problems
-from gapcert.spec.sections.declared import declared, declared_problems, unasked
 from gapcert.spec.sections.hidden import HiddenConfig
-from gapcert.spec.sections.measured import measured, measured_problems
 from gapcert.spec.sections.plugin_sections import Axes, SpecSection
 from gapcert.spec.sections.sections import GridSampling, LatticeSampling
+from gapcert.spec.sections.unsimulated import declared, declared_problems, measured, measured_problems, unasked
 from gapcert.spec.text.source import At, Problem
 
 NEEDS = {
