@@ -12,7 +12,8 @@ from rough_fields import Bump, Coarse
 
 import gapcert as gc
 from gapcert_bounds.families.constant import Constant
-from gapcert_bounds.families.envelope import Envelope, EnvelopeGap
+from gapcert_bounds.families.envelope import Envelope
+from gapcert_bounds.families.envelope_gap import EnvelopeGap
 from gapcert_bounds.testing.fields import Kink, Waves, gap_problem, lattice
 
 KINK = Kink(np.array([[0.5, 0.25, 0.125], [0.3, 1.0, 0.5]]), np.array([0.11, -0.3, 0.2]))

@@ -13,7 +13,8 @@ from gapcert.certification.bounds.refutation import contradiction
 from gapcert.contracts.gaps.predictor import Samples
 from gapcert.numerics.constraint_zone import Relation
 from gapcert_bounds.constants.lipschitz import IntervalJacobian
-from gapcert_bounds.families.envelope import Envelope, EnvelopeGap
+from gapcert_bounds.families.envelope import Envelope
+from gapcert_bounds.families.envelope_gap import EnvelopeGap
 from gapcert_bounds.testing.fields import Kink, Nothing, Waves, lattice, lipschitz_problem
 from gapcert_verify.verify import verify_run
 

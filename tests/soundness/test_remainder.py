@@ -18,7 +18,7 @@ import gapcert_networks
 from gapcert.certification.coordinates import Coordinates, RelativeGap, RelativePredictor
 from gapcert.contracts.gaps.predictor import Predictor
 from gapcert_bounds import MultilinearPredictor
-from gapcert_bounds.families.envelope import EnvelopeGap
+from gapcert_bounds.families.envelope_gap import EnvelopeGap
 from gapcert_bounds.families.multilinear import MultilinearGap
 from gapcert_bounds.families.piecewise_envelope import PiecewiseEnvelope
 from gapcert_bounds.testing.fields import Nothing, Waves, gap_problem, lattice

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from gapcert import Array, Domain, GapFunction, Interval
 from gapcert.plugin import Cells, Predictor
 
-from .envelope import EnvelopeGap, rounding
+from .envelope_gap import EnvelopeGap, rounding
 
 Index = npt.NDArray[np.intp]
 Ends = Callable[[EnvelopeGap, Interval], tuple[Interval, Interval]]
