@@ -21,7 +21,7 @@ sys.path.insert(0, str(ROOT / "docs"))
 PAGE = (ROOT / "docs" / "spec.md").read_text()
 ASKED = re.findall(r"^```{options} (\w+)$", PAGE, re.MULTILINE)
 # Whole sections of the core, and what wraps them for the checker alone.
-WRAPPERS = {"_Sampling", "_Sampled", "_Head", "_Ranges", "_Relations", "_Coordinates", "_Named", "Section"}
+WRAPPERS = {"_Sampling", "Sampled", "_Head", "_Ranges", "_Named", "Section"}
 
 
 @pytest.fixture(scope="module")
