@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, final
@@ -10,7 +11,6 @@ import numpy as np
 
 from gapcert.plugin import Array
 
-from .pages.packed import packed
 from .pictures.palette import variables
 
 if TYPE_CHECKING:
@@ -224,9 +224,26 @@ def as_data(ax: Axes, series: Sequence[Series], title: str, link: str) -> Mappin
     for key, axis, limits in (("x", ax.xaxis, ax.get_xlim()), ("y", ax.yaxis, ax.get_ylim())):
         name, _, unit = axis.get_label_text().partition(" [")
         axes[key] = {"name": name, "unit": unit.removesuffix("]"), "limits": limits, "log": axis.get_scale() == "log"}
-    shown = [{"name": s.name, "kind": s.kind, "parts": [_packed(p) for p in s.parts]} for s in series]
+    small = [[{k: packed(v) if isinstance(v, np.ndarray) else v for k, v in p.items()} for p in s.parts] for s in series]
+    shown = [{"name": s.name, "kind": s.kind, "parts": parts} for s, parts in zip(series, small, strict=True)]
     return {"title": title, "box": [round(v, 2) for v in box], **axes, "series": shown, "link": link}
 
 
-def _packed(part: Mapping[str, Any]) -> dict[str, Any]:
-    return {k: packed(v) if isinstance(v, np.ndarray) else v for k, v in part.items()}
+def packed(values: Array) -> dict[str, Any]:
+    """An array in JSON, small: evenly spaced as {n, first, step}; steps as {runs} of (whole number or None, how often); else
+    as {offset, f32} in base64: seven digits of every value, where all are close of its distance from the offset. NaN stands for
+    what is not there.
+    """
+    values = np.asarray(values, float).ravel()
+    known = values[np.isfinite(values)]
+    n, wide, top = len(values), float(np.ptp(known)) if len(known) else 0.0, float(np.abs(known).max(initial=0.0))
+    if n > 2 and len(known) == n:
+        first, step = float(values[0]), float(values[-1] - values[0]) / (n - 1)
+        if np.allclose(values, first + step * np.arange(n), rtol=0, atol=1e-9 * max(wide, 1e-3 * top)):
+            return {"n": n, "first": first, "step": step}
+    starts = np.flatnonzero(np.append(True, ~((values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1])))))
+    if 4 * len(starts) < n and (known == np.round(known)).all():
+        counts = np.diff(np.append(starts, n)).tolist()
+        return {"runs": [[None if np.isnan(v) else int(v), c] for v, c in zip(values[starts], counts, strict=True)]}
+    offset = float(known[0]) if top > 100 * wide else 0.0
+    return {"offset": offset, "f32": base64.b64encode((values - offset).astype("<f4").tobytes()).decode()}

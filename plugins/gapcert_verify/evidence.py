@@ -16,7 +16,6 @@ import numpy.typing as npt
 from gapcert.plugin import DAMAGE, Array, Interval, Relation, UsageError, Zone, clipped, grid_at, grid_size
 from gapcert_functions import Expression, Factor
 
-from .functions import dominating, network
 from .multilinear import band, predicted
 
 BLOCK = 1 << 17  # entries of a working array, which a cache then holds
@@ -342,14 +341,28 @@ def factor(kind: str, number: float, x: Interval) -> Interval:
     return (x * float(number)).sin() if kind == "sin" else (x * float(number)).cos()
 
 
+def dominated(e: Evidence, z: Array, p: Interval) -> tuple[Interval, Interval]:
+    """(l, u) of two functions, lifted over the envelope."""
+    from .functions import dominating  # late: networks need SciPy
+
+    return dominating(e.data["form"], e.arrays, e.zone, z, p)
+
+
+def of_network(e: Evidence, z: Array) -> Interval:
+    """γ_i(z) = max(0, q_i(z) + margin_i)."""
+    from .functions import network
+
+    return (network(e.data["form"], e.arrays).over(Interval.exact(z)) + e.arrays["gap.margin"]).maximum(0.0)
+
+
 _BANDS: Mapping[str, Callable[[Evidence, Array, Interval], tuple[Interval, Interval]]] = {
     "envelope": envelope,
     "multilinear": interpolation,
-    "dominating": lambda e, z, p: dominating(e.data["form"], e.arrays, e.zone, z, p),
+    "dominating": dominated,
 }
 _BOUNDS: Mapping[str, Callable[[Evidence, Array], Interval]] = {
     "constant": lambda e, z: Interval.exact(np.broadcast_to(e.arrays["gap.gamma"], (len(z), len(e.arrays["gap.gamma"])))),
     "basis": basis,
-    "network": lambda e, z: (network(e.data["form"], e.arrays).over(Interval.exact(z)) + e.arrays["gap.margin"]).maximum(0.0),
+    "network": of_network,
 }
 """Forms of gap functions: those with a predictor and two ends, and those with γ alone."""

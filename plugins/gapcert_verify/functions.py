@@ -61,7 +61,7 @@ def own_constant(form: Mapping[str, Any], arrays: Arrays, i: int) -> float:
 
 
 def network(form: Mapping[str, Any], arrays: Arrays) -> Network:
-    """q of form `network`, γ_i(z) = max(0, q_i(z) + margin_i); ValueError unless it has one output for each state."""
+    """q of form `network`; ValueError unless it has one output for each state."""
     q, nx = function(form["q"], arrays, "gap.q."), len(arrays["lipschitz"])
     # An output too few would serve several states, and its constant would be sought beyond the last weights.
     if not isinstance(q, Network) or q.n_out != nx:

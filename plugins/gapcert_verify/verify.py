@@ -149,21 +149,16 @@ def _trusted(e: Evidence) -> list[str]:
         sentences.append(
             "The predictor's values at samples and audited points are those of its model, which was not run again."
         )
-    if e.data.get("hidden"):
-        sentences.append("Hidden state was probed, drawn and attacked as stated: its values are not stored.")
-    if e.zone.relations:
-        sentences.append("The texts of the relations say what their coefficients do.")
-    if e.data.get("symmetry"):
-        sentences.append("The declared symmetry holds beyond the pairs that were looked at.")
-    if e.reduced:
-        sentences.append(
-            f"Of {e.data['samples']['bound']} samples those that are not stored lie within the extremes of their coarse cells."
-        )
-    if noise(e):
-        sentences.append("The backend's draws for different seeds are independent.")
-    if e.data.get("attack"):
-        sentences.append("The attack's counts are as stated: its points are not stored.")
-    return sentences
+    count = e.data["samples"]["bound"] if e.reduced else 0
+    told = {
+        "Hidden state was probed, drawn and attacked as stated: its values are not stored.": e.data.get("hidden"),
+        "The texts of the relations say what their coefficients do.": e.zone.relations,
+        "The declared symmetry holds beyond the pairs that were looked at.": e.data.get("symmetry"),
+        f"Of {count} samples those that are not stored lie within the extremes of their coarse cells.": e.reduced,
+        "The backend's draws for different seeds are independent.": noise(e),
+        "The attack's counts are as stated: its points are not stored.": e.data.get("attack"),
+    }
+    return [*sentences, *(text for text, so in told.items() if so)]
 
 
 def _attempt(check: Callable[[Evidence], str | None], evidence: Evidence) -> str | None:
@@ -277,14 +272,8 @@ def _function(e: Evidence) -> str:
             return "the envelope's remainders are not r − p at the samples"
         same = {"gap.z": z, "gap.L": e.arrays["lipschitz"], "gap.e": e.arrays["remainder.resolution"]}
         same |= {f"gap.{k}": v for k, v in e.arrays.items() if k.startswith("cells.")}
-        return next(
-            (
-                f"{k} of the envelope is not that of the certificate"
-                for k, v in same.items()
-                if not np.array_equal(e.arrays[k], v)
-            ),
-            "",
-        )
+        other = next((k for k, v in same.items() if not np.array_equal(e.arrays[k], v)), None)
+        return f"{other} of the envelope is not that of the certificate" if other else ""
     if route in ("calibrate", "declared"):
         return ""  # any function may be calibrated, and any constant declared
     if form == "dominating":

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import gapcert as gc
 from gapcert_figures.data import Figures
-from gapcert_report.pages.packed import packed
+from gapcert_report.harvest import packed
 from gapcert_report.pictures.album import album_of
 from gapcert_report.pictures.gap import band_pictures, slice_pictures
 from gapcert_report.pictures.svg import draw, heat

@@ -27,12 +27,12 @@ from .svg import Picture
 class Album:
     """All pictures of a run, each once: those that carry the answer in `hero`, the others with their section."""
 
-    hero: tuple[Picture, ...]
-    pairs: tuple[Picture, ...]
-    bands: tuple[Picture, ...]
-    other_axes: tuple[Picture, ...]
-    loop: tuple[Picture, ...]
     diagnosis: DiagnosisAlbum
+    hero: tuple[Picture, ...] = ()
+    pairs: tuple[Picture, ...] = ()
+    bands: tuple[Picture, ...] = ()
+    other_axes: tuple[Picture, ...] = ()
+    loop: tuple[Picture, ...] = ()
 
 
 def _loop_pictures(figures: Figures) -> tuple[list[Picture], list[Picture]]:
@@ -67,10 +67,10 @@ def album_of(figures: Figures, summary: Mapping[str, Any]) -> Album:
     d = diagnosis_album(figures.diagnosis, summary)
     if figures.recorded is not None:
         recorded = recorded_pictures(figures.recorded)
-        return Album(tuple(recorded[:3]), (), tuple(recorded[3:]), (), (), d)
+        return Album(d, tuple(recorded[:3]), bands=tuple(recorded[3:]))
     if first:
         shown = 1 if loop else 3  # a row has room for three
-        return Album((*first[:shown], *loop), tuple(gap), tuple(first[shown:]), tuple(others), tuple(rest), d)
+        return Album(d, (*first[:shown], *loop), tuple(gap), tuple(first[shown:]), tuple(others), tuple(rest))
     if not d.hero:  # γ was declared, and there is only what it buys
-        return Album(tuple(loop), (), (), (), tuple(rest), d)
-    return Album(d.hero, (), (), (), (*loop, *rest), d)
+        return Album(d, tuple(loop), loop=tuple(rest))
+    return Album(d, d.hero, loop=(*loop, *rest))
