@@ -37,7 +37,9 @@ from tube_program import twin
 
 import gapcert as gc
 from gapcert.testing.synthesis import Band, Rod, rod_problem
-from gapcert_mpc.controller import Design, Engine, MpcController
+from gapcert_mpc.controller import MpcController
+from gapcert_mpc.planning.design import Design
+from gapcert_mpc.planning.engine import Engine
 from gapcert_mpc.program.solver import solver
 from gapcert_mpc.synthesizer import Mpc
 

@@ -4,98 +4,167 @@ from __future__ import annotations
 
 import hashlib
 import json
+from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, final
+from typing import Any, Generic, Protocol, TypeVar, final
 
 import numpy as np
 
 from gapcert import Array, Controller, Event, Goal, UsageError
 from gapcert.plugin import Bools, Ints, Policy, Pulse
-from gapcert_cells import write_saved
+from gapcert_cells import loading, write_saved
 
-from .plans import Held, Memory, Plan, plan
+from .planning.arrival import Arrival
+from .planning.design import Design
+from .planning.engine import Engine, Planner, Tracker
+from .planning.plans import Held, Memory, Plan
+from .planning.successive import Successive
+from .planning.terminal_boxes import Landing
+from .planning.tracking import another
 from .program.linearise import Nominal
-from .program.pieces import Pieces
-from .program.solver import Name, Piqp, QpSolver, solver
-from .saved.design import Design as Design
-from .saved.saved_models import pair
-from .tracking import another
-from .variants.arrival import Arrival, Pool
-from .variants.successive import Successive
-from .variants.terminal_boxes import Landing
-
-if TYPE_CHECKING:
-    from .variants.adaptive import AdaptiveMpcController
-    from .variants.disturbance import DisturbanceMpcController
+from .program.solver import Name
+from .saved_models import known, pair
 
 LOOK = 8
 
 
-@final
-class Engine:
-    """The program with who solves it: pieces, a fast solver, and one that always finishes, and knows what is infeasible."""
+class Remembered(Protocol):
+    """What a run remembers: the steps since its plan was made, and how many of all its steps went on with a plan."""
 
-    def __init__(self, design: Design, first: Name) -> None:
-        self.program = p = design.program()
-        data, tuning = (p.P, p.q, p.A, p.low, p.high, p.tolerance), design.tuning
-        self.pieces = Pieces(p, tuning.pieces, design.reference[: p.n]) if p.steady else None
-        own = {"rho": tuning.rho, "alpha": tuning.alpha} if first == "osqp" else {}
-        self.solvers: list[QpSolver] = [solver(first, *data, **own)]
-        if first != "piqp":
-            self.solvers.append(Piqp(*data))
-        self.later = p.shifted()
-        self.rest = design.reference[p.n :]
-        self.arrival: Arrival | Landing | None = None
-        if design.scene is not None:
-            self.arrival = Arrival(self, design.scene, design.pool or Pool.of([], p))
-        elif design.ends is not None:
-            self.arrival = Landing(self, design.ends)
+    @property
+    def age(self) -> int: ...
 
-    def solve(self, x: Array, guess: Plan | None, before: Array | None = None) -> Plan | None:
-        """A plan from x (frame) after an input, checked row by row; None where there is none. A pure function of all these."""
-        first = 0 if guess is None else guess.piece
-        if self.pieces is not None and (known := self.pieces(x, first)) is not None:
-            return plan(self.program, *known)
-        return self.found(x, *self._guess(guess), first, before=before)
-
-    def found(
-        self, x: Array, z: Array, y: Array, first: int = 0, A: Array | None = None, before: Array | None = None
-    ) -> Plan | None:
-        """By the first solver that finds one, from a guess; A: its new values, if it has any."""
-        program = self.program
-        program.begin(x, before)
-        for s in self.solvers:
-            s.update(A=A, q=program.q, low=program.low, high=program.high)
-            found = s.solve(z, y)
-            last = s is self.solvers[-1]
-            if found.status == "infeasible" and last:
-                return None
-            # Rows decide: a plan that keeps them is one, though it may not be the best.
-            if found.status == "solved" or last:
-                # Where lines vary, the tube is taken along the lines of the plan.
-                kept = found.z if A is not None or self.pieces is None else self.pieces.least(found.z)
-                # NaN compares as False, so that it keeps nothing.
-                if program.missed(kept, x, before) <= program.tolerance:
-                    return plan(program, kept, found.y, first)
-        return None
-
-    def _guess(self, guess: Plan | None) -> tuple[Array, Array]:
-        if guess is None:
-            return self.later[2], self.later[3]
-        return guess.z[self.later[0]], guess.y[self.later[1]]
+    @property
+    def shifted(self) -> int: ...
 
 
-@final
-@dataclass(frozen=True, eq=False)
-class MpcController(Controller):
-    """Tube MPC: contains a state if a plan begins there; a run's memory is the number of its plan.
+R = TypeVar("R", bound=Remembered)
+C = TypeVar("C", bound=Any)
+
+
+class PlanController(Controller, Generic[R]):
+    """Contains a state if a plan begins there; a run's memory is the number of what it remembers.
 
     A plan is a certificate by itself: where a solve fails, the run goes on with what is left of its plan, and with the terminal
     set's feedback after it, and nothing of the promise is lost.
     """
+
+    design: Design | None
+    memory: Memory[R]
+    counts: dict[str, int]
+
+    @abstractmethod
+    def _next(self, x: Array, held: R | None) -> R | None:
+        """At x (frame): with a new plan, or with what is left of the one that is held; None where there is neither."""
+
+    @abstractmethod
+    def _input(self, x: Array, held: R) -> Array:
+        """(m,) at x, both in the frame."""
+
+    @abstractmethod
+    def _held(self, x: Array, held: R) -> bool:
+        """Is x (frame) where a run that remembers this may be?"""
+
+    @abstractmethod
+    def _stepped(self, u: Array, after: Array, held: R) -> bool:
+        """Did a step under u, in the model's units, come to where it may end, `after` (frame)?"""
+
+    @abstractmethod
+    def _foreseen(self, held: R) -> tuple[Array, Array]:
+        """Centres and half-widths of the states from now on, in the frame."""
+
+    @property
+    def _design(self) -> Design:
+        assert self.design is not None, "a controller that wins nowhere plans nothing"
+        return self.design
+
+    @property
+    def policies(self) -> tuple[Policy, ...]:
+        return ("first",)
+
+    @cached_property
+    def _turns(self) -> Array | None:
+        """2π for angles, and infinity for what never comes back; None where nothing does."""
+        turns = np.array([2 * np.pi if axis.kind == "angle" else np.inf for axis in self.goal.stay.axes])
+        return turns if np.isfinite(turns).any() else None
+
+    def framed(self, x: Array) -> Array:
+        """States (n, nx) in the frame; angles by the turn that is nearest to its middle."""
+        middle, half = self._design.frame.x
+        x, turns = np.atleast_2d(np.asarray(x, dtype=np.float64)) - middle, self._turns
+        if turns is not None and (np.abs(x) > turns / 2).any():
+            some = np.isfinite(turns)
+            x[:, some] -= turns[some] * np.round(x[:, some] / turns[some])
+        return np.asarray(x / half)
+
+    def contains(self, x: Array) -> Bools:
+        return np.asarray(self.start(x) > 0)
+
+    def start(self, x: Array) -> Ints:
+        """The number of what a run that begins there remembers; 0 where there is no plan."""
+        if self.design is None:
+            return np.zeros(len(x), dtype=np.int64)
+        return np.array([self.memory.begin(row, lambda x: self._next(x, None)) for row in self.framed(x)], dtype=np.int64)
+
+    def advance(self, x: Array, memory: Ints) -> Ints:
+        out = np.zeros(len(x), dtype=np.int64)
+        for i, (row, held) in enumerate(zip(self.framed(x), self.memory.of(memory), strict=True)):
+            if held is not None and (then := self._next(row, held)) is not None:
+                out[i] = self.memory.add(then)
+                self.counts["shifted" if then.age else "solved"] += 1
+        return out
+
+    def keeps(self, x: Array, memory: Ints) -> Bools:
+        if self.design is None:
+            return np.zeros(len(x), dtype=bool)
+        at = zip(self.framed(x), self.memory.of(memory), strict=True)
+        return np.array([held is not None and self._held(row, held) for row, held in at], np.bool_)
+
+    def respond(self, x: Array, memory: Ints, policy: Policy, seed: int = 0, k: int = 0) -> Array:
+        middle, half = self.design.frame.u if self.design is not None else np.empty((2, 0))
+        out = np.empty((len(x), len(half)))
+        for i, held in enumerate(self.memory.of(memory)):
+            if held is None:
+                raise UsageError(
+                    f"controller: row {i}: no plan begins at {np.asarray(x)[i].tolist()}; ask `contains` before `act`"
+                )
+            out[i] = middle + half * self._input(self.framed(x[i])[0], held)
+        return out
+
+    def act(self, x: Array, policy: Policy = "first", seed: int = 0, k: int = 0) -> Array:
+        return self.respond(x, self.start(np.atleast_2d(x)), policy, seed, k)
+
+    def kept(self, x: Array, u: Array, after: Array, memory: Ints | None = None) -> Bools:
+        """(n,): did the step end in the tube of the plan that was being kept, after an input that was not far from the last?"""
+        numbers = self.start(x) if memory is None else memory
+        steps = zip(u, self.framed(after), self.memory.of(numbers), strict=True)
+        out = np.array([h is not None and self._stepped(v, row, h) for v, row, h in steps], np.bool_)
+        return np.asarray(out | self.over(after, numbers))
+
+    def fallbacks(self, memory: Ints) -> Ints:
+        """(n,): steps of each run that went on with a plan of before, with the one that is about to be made."""
+        return np.array([0 if held is None else held.shifted for held in self.memory.of(memory)], dtype=np.int64)
+
+    def predicted(self, x: Array, memory: Ints | None = None) -> tuple[Array, Array, Array] | None:
+        """Centres and boxes of the steps to come, as far as they are planned, angles by the turn that x is at."""
+        numbers = self.start(x[None]) if memory is None else memory
+        if (held := self.memory[int(numbers[0])]) is None:
+            return None
+        centre, wide = self._foreseen(held)
+        middle, half = self._design.frame.x
+        turn = x - middle - half * self.framed(x[None])[0]
+        low, high, at = (middle + turn + half * z for z in (centre - wide, centre + wide, centre))
+        at[0] = low[0] = high[0] = x
+        return at, low, high
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class MpcController(PlanController[Held]):
+    """Tube MPC: a plan with a tube about it, kept by one gain."""
 
     goal: Goal
     design: Design | None
@@ -112,73 +181,37 @@ class MpcController(Controller):
 
     @cached_property
     def engine(self) -> Engine:
-        assert self.design is not None, "a controller that wins nowhere solves nothing"
-        return Engine(self.design, self.solver)
+        return Engine(self._design, self.solver)
 
     @cached_property
-    def successive(self) -> Successive:
-        assert self.design is not None
+    def planner(self) -> Planner:
+        engine, design = self.engine, self._design
+        if design.scene is not None:
+            return Arrival(engine, design.scene, design.pool)
+        if design.ends is not None:
+            return Landing(engine, design.ends)
+        if not design.successive:
+            return Tracker(engine, design)
         assert self.nominal is not None, "plans along their own lines need the model"
         # A plan with its lines takes some ten kilobytes.
         self.memory.most = min(self.memory.most, 1 << 13)
-        return Successive(self.engine, self.design, self.nominal)
+        return Successive(engine, design, self.nominal)
 
     @property
     def wins(self) -> bool:
         return self.design is not None
 
-    @property
-    def policies(self) -> tuple[Policy, ...]:
-        return ("first",)
-
-    @cached_property
-    def _turns(self) -> Array | None:
-        """2π for angles, and infinity for what never comes back; None where nothing does."""
-        turns = np.array([2 * np.pi if axis.kind == "angle" else np.inf for axis in self.goal.stay.axes])
-        return turns if np.isfinite(turns).any() else None
-
-    def framed(self, x: Array) -> Array:
-        """States (n, nx) in the frame; angles by the turn that is nearest to its middle."""
-        assert self.design is not None
-        middle, half = self.design.frame.x
-        x, turns = np.atleast_2d(np.asarray(x, dtype=np.float64)) - middle, self._turns
-        if turns is not None and (np.abs(x) > turns / 2).any():
-            some = np.isfinite(turns)
-            x[:, some] -= turns[some] * np.round(x[:, some] / turns[some])
-        return np.asarray(x / half)
-
     def _next(self, x: Array, held: Held | None) -> Held | None:
-        """A new plan from a state in the frame, guessed from the one that is held, or what is left of that."""
-        assert self.design is not None
         made, before = None, held and held.u
         # NaN compares as False.
         if np.abs(x).max() <= 1.0 and (before is None or np.isfinite(before).all()):
-            made = self._solved(x, held)
+            made = self.planner.solve(x, held)
         then = held and held._replace(age=held.age + 1, shifted=held.shifted + 1, step=held.step + 1)
         if made is not None:
             then = held._replace(plan=made, age=0, step=held.step + 1) if held else Held(made)
-        if then is None or self.design.rates is None:
+        if then is None or self._design.rates is None:
             return then
-        return then._replace(u=then.plan.input(x, then.age, self.design.section.K), before=before)
-
-    def _solved(self, x: Array, held: Held | None) -> Plan | None:
-        assert self.design is not None
-        if self.engine.arrival is not None:
-            return self.engine.arrival.follow(x, held.plan, held.age) if held else self.engine.arrival.begin(x)
-        if self.design.successive:
-            return self.successive.solve(x, held)
-        self._aim(held)
-        return self.engine.solve(x, held and held.plan, held and held.u)
-
-    def _aim(self, held: Held | None) -> None:
-        """Before a plan is made: what is wanted at each of its stages, whatever was solved in between."""
-        assert self.design is not None
-        n, N, z = self.design.frame.nx, self.design.stages.horizon, self.design.reference[None]
-        if held is not None and held.aim is not None:
-            z = held.aim[None]
-        elif self.design.course is not None:
-            z = self.design.course.ahead(0 if held is None else held.step + 1, N + 1)
-        self.engine.program.aim(z[:, :n], z[:N, n:])
+        return then._replace(u=then.plan.input(x, then.age, self._design.section.K), before=before)
 
     def aim(self, reference: Mapping[str, float | str], memory: Ints) -> Ints:
         """Memory of the same runs, whose plans are drawn to other states from the next step on; only the cost is another.
@@ -188,124 +221,50 @@ class MpcController(Controller):
         """
         if self.design is None or self.design.successive or self.design.scene or self.design.ends:
             raise UsageError("aim: only invariance, along one straight line, takes another reference; make another controller")
-        held = [self.memory[number] for number in memory.tolist()]
         z = another(self.engine.program, self.design.frame, reference, self.goal.stay.axes)
+        held = self.memory.of(memory)
         return np.array([0 if h is None else self.memory.add(h._replace(aim=z)) for h in held], dtype=np.int64)
 
-    def _input(self, x: Array, plan: Plan, age: int) -> Array:
-        assert self.design is not None
-        middle, half = self.design.frame.u
-        return np.asarray(middle + half * plan.input(x, age, self.design.section.K))
+    def respond(self, x: Array, memory: Ints, policy: Policy, seed: int = 0, k: int = 0) -> Array:
+        for i, held in enumerate(self.memory.of(memory)):
+            if held is not None and held.age == held.plan.arrival:
+                raise UsageError(f"controller: row {i}: the goal is reached; ask `goal.reached` before `act`")
+        return super().respond(x, memory, policy, seed, k)
 
-    def contains(self, x: Array) -> Bools:
-        return np.asarray(self.start(x) > 0)
+    def _input(self, x: Array, held: Held) -> Array:
+        return held.plan.input(x, held.age, self._design.section.K)
 
-    def start(self, x: Array) -> Ints:
-        """The number of a plan that begins there; 0 where there is none."""
-        out = np.zeros(len(x), dtype=np.int64)
-        if self.design is None:
-            return out
-        for i, row in enumerate(self.framed(x)):
-            out[i] = self.memory.begin(row, lambda x: self._next(x, None))
-        return out
+    def _held(self, x: Array, held: Held) -> bool:
+        return self._within(x, held.plan, held.age)
 
-    def advance(self, x: Array, memory: Ints) -> Ints:
-        out = np.zeros(len(x), dtype=np.int64)
-        for i, (row, number) in enumerate(zip(self.framed(x), memory.tolist(), strict=True)):
-            if (held := self.memory[number]) is not None and (then := self._next(row, held)) is not None:
-                out[i] = self.memory.add(then)
-                self.counts["shifted" if then.age else "solved"] += 1
-        return out
-
-    def keeps(self, x: Array, memory: Ints) -> Bools:
-        out = np.zeros(len(x), dtype=bool)
-        if self.design is None:
-            return out
-        for i, (row, number) in enumerate(zip(self.framed(x), memory.tolist(), strict=True)):
-            held = self.memory[number]
-            out[i] = held is not None and self._within(row, held.plan, held.age)
-        return out
+    def _stepped(self, u: Array, after: Array, held: Held) -> bool:
+        (middle, half), rates = self._design.frame.u, self._design.rates
+        slow = rates is None or held.before is None or (np.abs((u - middle) / half - held.before) <= rates + 1e-9).all()
+        return bool(slow) and self._within(after, held.plan, held.age + 1)
 
     def _within(self, x: Array, plan: Plan, age: int) -> bool:
-        assert self.design is not None
         if plan.arrival is not None and age > plan.arrival:
             return False
         centre, _, size = plan.stage(age)
-        return bool((np.abs(self.design.section.H @ (x - centre)) <= size + 1e-9).all())
+        return bool((np.abs(self._design.section.H @ (x - centre)) <= size + 1e-9).all())
 
-    def _slow(self, u: Array, held: Held) -> bool:
-        assert self.design is not None
-        if self.design.rates is None or held.before is None:
-            return True
-        middle, half = self.design.frame.u
-        return bool((np.abs((u - middle) / half - held.before) <= self.design.rates + 1e-9).all())
-
-    def respond(self, x: Array, memory: Ints, policy: Policy, seed: int = 0, k: int = 0) -> Array:
-        out = np.empty((len(x), 0 if self.design is None else len(self.design.frame.half) - self.design.frame.nx))
-        for i, number in enumerate(memory.tolist()):
-            if (held := self.memory[number]) is None:
-                raise UsageError(
-                    f"controller: row {i}: no plan begins at {np.asarray(x)[i].tolist()}; ask `contains` before `act`"
-                )
-            if held.age == held.plan.arrival:
-                raise UsageError(f"controller: row {i}: the goal is reached; ask `goal.reached` before `act`")
-            out[i] = self._input(self.framed(x[i])[0], held.plan, held.age)
-        return out
-
-    def act(self, x: Array, policy: Policy = "first", seed: int = 0, k: int = 0) -> Array:
-        return self.respond(x, self.start(np.atleast_2d(x)), policy, seed, k)
-
-    def kept(self, x: Array, u: Array, after: Array, memory: Ints | None = None) -> Bools:
-        """(n,): did the step end in the tube of the plan that was being kept, after an input that was not far from the last?"""
-        numbers = self.start(x) if memory is None else memory
-        out = np.zeros(len(after), dtype=bool)
-        for i, (row, number) in enumerate(zip(self.framed(after), numbers.tolist(), strict=True)):
-            held = self.memory[number]
-            out[i] = held is not None and self._within(row, held.plan, held.age + 1) and self._slow(u[i], held)
-        return np.asarray(out | self.over(after, numbers))
-
-    def restart(self) -> None:
-        """The next `step` begins another run."""
-        self.counts["online"] = 0
-
-    def fallbacks(self, memory: Ints) -> Ints:
-        """(n,): steps of each run that went on with a plan of before, with the one that is about to be made."""
-        held = [self.memory[n] for n in memory.tolist()]
-        return np.array([0 if h is None else h.shifted for h in held], dtype=np.int64)
+    def _foreseen(self, held: Held) -> tuple[Array, Array]:
+        """As far as the horizon or arrival goes."""
+        plan, age, support = held.plan, held.age, self._design.section.support[: self._design.frame.nx]
+        last = len(plan.x) if plan.arrival is None else plan.arrival + 1
+        if age >= last:
+            return plan.xs[None], plan.sigma[None] @ support.T
+        return plan.x[age:last], plan.s[age:last] @ support.T
 
     @property
     def resolution(self) -> int:
         """A program is solved for each point, or several."""
         return 12 if self.nominal is not None else 40 if self.design is None or self.design.scene is None else 24
 
-    def predicted(self, x: Array, memory: Ints | None = None) -> tuple[Array, Array, Array] | None:
-        """x̄ and its tube for the steps to come, as far as the horizon or arrival goes; row 0 is x itself."""
-        numbers = self.start(x[None]) if memory is None else memory
-        held = self.memory[int(numbers[0])]
-        if held is None or self.design is None:
-            return None
-        plan, age = held[:2]
-        E = self.design.section.support[: len(x)]
-        last = len(plan.x) if plan.arrival is None else plan.arrival + 1
-        centre, wide = plan.x[age:last], plan.s[age:last] @ E.T
-        if not len(centre):
-            centre, wide = plan.xs[None], plan.sigma[None] @ E.T
-        return self.foreseen(x, centre, wide)
-
     def wanted(self, count: int) -> Array | None:
         if self.design is None or self.design.course is None:
             return None
         return self.design.frame.out(self.design.course.ahead(0, count))[:, : self.design.frame.nx]
-
-    def foreseen(self, x: Array, centre: Array, wide: Array) -> tuple[Array, Array, Array]:
-        """Boxes of states that are foreseen from x (nx,), given in the frame: centre, low, high; row 0 is x itself."""
-        assert self.design is not None
-        middle, half = self.design.frame.x
-        # Of the angles the turn that x is at.
-        turn = x - middle - half * self.framed(x[None])[0]
-        low, high, at = (middle + turn + half * z for z in (centre - wide, centre + wide, centre))
-        at[0] = low[0] = high[0] = x
-        return at, low, high
 
     def arrays(self) -> dict[str, Array]:
         return {} if self.design is None else self.design.arrays()
@@ -332,17 +291,42 @@ class MpcController(Controller):
         return data | {"solver": self.solver, "digest": self.digest()}
 
     @classmethod
-    def load(
-        cls, folder: Path | str, nominal: Nominal | None = None
-    ) -> MpcController | DisturbanceMpcController | AdaptiveMpcController:
+    def load(cls, folder: Path | str, nominal: Nominal | None = None) -> MpcController:
         """Inverse of `save`; UsageError where the files are absent, damaged or do not belong together.
 
         A controller that makes the model straight about its plans asks the model and the gap again: its `nominal`, which is
-        saved with it but for models that are not equations.
+        saved with it but for models that are not equations. One that is part of another is loaded with that.
         """
-        from .saved.loaded import loaded
+        return loaded(folder, lambda data, arrays: cls.read(Path(folder), data, arrays, nominal))
 
-        return loaded(cls, Path(folder), nominal)
+    @classmethod
+    def read(cls, folder: Path, data: Mapping[str, Any], arrays: Mapping[str, Array], nominal: Nominal | None) -> MpcController:
+        """Of what stands in the files of a folder."""
+        design = Design.of(arrays) if arrays else None
+        if design is not None and design.ends is not None:
+            raise UsageError(f"{folder}: where its plans end another controller takes over; load it with load_controller")
+        if design is None or not design.successive:
+            nominal = None
+        elif nominal is None and not data.get("kept"):
+            raise UsageError(
+                f"{folder}: this controller linearises its model at every step, and its model or gap could not be saved as "
+                f"data; give both as MpcController.load(folder, Nominal(model, gap))"
+            )
+        elif nominal is None:
+            told = known(data["kept"], arrays)
+            nominal = Nominal(told["model"], told["gap"])
+        return cls(Goal.from_data(data["goal"]), design, data["evidence"], data["solver"], nominal=nominal)
+
+
+def loaded(
+    folder: Path | str, made: Callable[[Any, dict[str, Array]], C], files: str = "controller.npz and controller.json"
+) -> C:
+    """What is made of the data and arrays in a folder; UsageError where they are absent, damaged, or not of one controller."""
+    with loading(Path(folder)) as (data, arrays):
+        found = made(data, {name: arrays[name] for name in arrays.files})
+    if found.digest() != data.get("digest"):
+        raise UsageError(f"{Path(folder)}: {files} do not belong together; synthesize it again")
+    return found
 
 
 def looked(controller: Controller, x: Array, emit: Callable[[Event], None]) -> Bools:

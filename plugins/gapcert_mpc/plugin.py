@@ -14,6 +14,6 @@ def gapcert_components() -> list[gapcert.Component]:
             "gapcert_mpc.config:MpcConfig",
             requires=("osqp", "piqp"),
             extra="mpc",
-            controller="gapcert_mpc.variants.terminal:HandedController",
+            controller="gapcert_mpc.synthesizer:Mpc",
         )
     ]

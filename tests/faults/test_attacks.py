@@ -545,7 +545,7 @@ def test_classes_that_are_reached_through_modules(tmp_path):
     import gc as garbage
     import tempfile
 
-    from gapcert_mpc.saved.saved_models import again
+    from gapcert_mpc.saved_models import again
 
     victim = tmp_path / "victim"
     victim.touch()

@@ -15,7 +15,8 @@ from gapcert_closed_loop.closed_loop import compare_loops
 from gapcert_closed_loop.parameter_sets import summary
 from gapcert_figures.data import loop_figure
 from gapcert_mpc.controller import MpcController
-from gapcert_mpc.synthesizer import STARTS, Mpc
+from gapcert_mpc.synthesizer import Mpc
+from gapcert_mpc.task import STARTS
 from gapcert_mpc.variants.adaptive import Levels
 from gapcert_mpc.variants.membership import Membership
 from gapcert_mpc.variants.parameters import Family, built
@@ -230,7 +231,7 @@ def test_outside_the_domain_nothing_is_learned(controller):
 
 
 def test_levels_hold_what_they_are_for():
-    levels = Levels(Family.of(problem(), {"m": [0.7, 1.4]}), {}, 6)
+    levels = Levels(Family.of(problem(), {"m": [0.7, 1.4]}), {}, 6, Mpc().for_box)
     rng, whole = np.random.default_rng(4), levels.family.range
     for _ in range(200):
         key, theta = levels.first, whole
@@ -422,5 +423,5 @@ def test_a_rod_in_bullet_that_is_heavier_than_its_data_sheet(tmp_path):
     trace = closed_loop(backend, c, x, 25)
     assert not trace.violation.any()
     assert not trace.broken.any()
-    theta = c.theta(np.array(list(c.runs)[-10:]))
+    theta = c.theta(np.array(list(c.runs.kept)[-10:]))
     assert ((theta.lo <= 1.3) & (theta.hi >= 1.3) & (theta.hi - theta.lo < 0.15)).all()

@@ -135,9 +135,9 @@ def test_a_plan_that_does_not_answer_breaks_it(flaw: str, monkeypatch: pytest.Mo
     controller = without_solver(made(), x)
     input_of = DisturbanceMpcController._input
 
-    def flawed(self: DisturbanceMpcController, run: Run) -> Array:
+    def flawed(self: DisturbanceMpcController, x: Array, run: Run) -> Array:
         past = 0.0 * run.past if flaw == "deaf" else np.vstack([0.0 * run.past[:1], run.past[:-1]])
-        return input_of(self, run._replace(past=past))
+        return input_of(self, x, run._replace(past=past))
 
     monkeypatch.setattr(DisturbanceMpcController, "_input", flawed)
     assert pushed(controller, WIDE, x, 5 * HORIZON, anew=False)[0].any()

@@ -20,7 +20,7 @@ from gapcert.numerics.constraint_zone import Relation
 from gapcert.testing.fields import Field
 from gapcert.testing.synthesis import Band
 from gapcert_mpc.controller import MpcController
-from gapcert_mpc.plans import Plan
+from gapcert_mpc.planning.plans import Plan
 from gapcert_mpc.program.corridors import Scene, parts, within
 from gapcert_mpc.program.linearise import Frame
 from gapcert_mpc.synthesizer import Mpc
@@ -168,7 +168,7 @@ def test_without_the_tube_they_collide(careful: MpcController) -> None:
 
 def test_a_corridor_that_is_not_shifted_is_found_out(careful: MpcController, monkeypatch: pytest.MonkeyPatch) -> None:
     """Programs become infeasible that are not else; plans in hand keep the promise all the same."""
-    arrival = careful.engine.arrival
+    arrival = careful.planner
     assert arrival is not None
 
     def unshifted(x: Array, plan: Plan, age: int) -> Plan | None:
@@ -276,7 +276,7 @@ def test_the_tube_at_rest_is_narrower_than_with_a_constant() -> None:
 def brute(controller: MpcController, x: Array) -> int | None:
     """The first arrival over all choices of a face of each obstacle at each stage, by linear programs."""
     engine = controller.engine
-    arrival, p = engine.arrival, engine.program
+    arrival, p = controller.planner, engine.program
     assert arrival is not None
     scene, (low0, high0) = arrival.scene, p.limits()
     for steps in range(1, p.N + 1):
@@ -304,7 +304,7 @@ def brute(controller: MpcController, x: Array) -> int | None:
 
 def test_the_search_arrives_as_soon_as_every_side_tried() -> None:
     controller = made(goal(box((1.4, 1.6), (0.0, 2.0))), Band((-0.02, -0.02), (0.02, 0.02)), horizon=4, searches=1)
-    arrival = controller.engine.arrival if controller.design else None
+    arrival = controller.planner if controller.design else None
     assert arrival is not None
     frame = controller.design.frame  # type: ignore[union-attr]
     found = []
@@ -372,7 +372,7 @@ def test_what_cannot_be_reached_has_a_reason() -> None:
 PRINTS = """
 import json
 import numpy as np, scipy.optimize
-from gapcert_mpc.search import optimum
+from gapcert_mpc.planning.search import optimum
 rng = np.random.default_rng(6)
 for _ in range(40):
     n, m = int(rng.integers(4, 10)), int(rng.integers(2, 6))

@@ -12,16 +12,16 @@ import pytest
 from gapcert import Domain, GapFunction, Goal, SynthesisProblem, UsageError, closed_loop, load_controller, registry
 from gapcert.testing.synthesis import Band
 from gapcert_equations.config import EquationsConfig
-from gapcert_mpc import controller, synthesizer
+from gapcert_mpc import controller, task
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.invariant import margin
-from gapcert_mpc.plans import Held
+from gapcert_mpc.planning import successive
+from gapcert_mpc.planning.plans import Held
+from gapcert_mpc.planning.successive import Successive
 from gapcert_mpc.program.linearise import Frame, Nominal, Stages
 from gapcert_mpc.program.program import Program
 from gapcert_mpc.program.solver import SOLVERS
 from gapcert_mpc.synthesizer import Mpc
-from gapcert_mpc.variants import successive
-from gapcert_mpc.variants.successive import Successive
 
 Array = np.ndarray
 CARTPOLE = {
@@ -60,7 +60,7 @@ QUADROTOR_GAP = np.array([3e-4, 3e-4, 3e-4, 3e-3, 3e-3, 3e-3])
 
 @pytest.fixture(autouse=True)
 def few_starts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(synthesizer.STARTS, "successive", 12)
+    monkeypatch.setitem(task.STARTS, "successive", 12)
 
 
 def problem(gap: GapFunction | None, spec: dict = CARTPOLE, ranges: dict = CARTPOLE_Z) -> SynthesisProblem:
@@ -82,14 +82,14 @@ def made(gap: GapFunction | None, **options: object) -> MpcController:
 @pytest.fixture(scope="module")
 def cartpole() -> Iterator[MpcController]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(synthesizer.STARTS, "successive", 16)
+        patch.setitem(task.STARTS, "successive", 16)
         yield made(band(CARTPOLE_GAP))
 
 
 @pytest.fixture(scope="module")
 def nominal() -> Iterator[MpcController]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(synthesizer.STARTS, "successive", 16)
+        patch.setitem(task.STARTS, "successive", 16)
         yield made(None)
 
 
@@ -228,7 +228,7 @@ def test_adopted_plans_keep_their_boxes(cartpole: MpcController) -> None:
     after = cartpole.framed(cartpole.nominal.model.step(x, u).x + CARTPOLE_GAP)
     for row, then, number in zip(cartpole.framed(x), after, memory.tolist(), strict=True):
         for x0, held in ((row, None), (then, cartpole.memory[number])):
-            plan = cartpole.successive.solve(x0, held)
+            plan = cartpole.planner.solve(x0, held)
             assert plan is not None
             st, wide = program.stages, plan.s[:-1] @ section.support.T
             z = np.hstack([plan.x[:-1], plan.u])
@@ -257,7 +257,7 @@ def test_lines_are_kept_where_they_hold(cartpole: MpcController, monkeypatch: py
     assert 0 < len(made) < 25
     plan = cartpole.memory[int(memory[0])].plan
     z = np.hstack([plan.x[:-1], plan.u])
-    lines, away = cartpole.successive.lines, plan.x[0] + [0.0, 0.5, 0.0, 0.0]
+    lines, away = cartpole.planner.lines, plan.x[0] + [0.0, 0.5, 0.0, 0.0]
     radius = lines.radius(plan.s[:-1], 0.02)
     assert lines.again(plan.x[0], z, radius, dataclasses.replace(plan.lines, low=-1 + 0 * plan.lines.low), 0) is None
     assert lines.again(away, z, radius, plan.lines, 0) is None
@@ -266,7 +266,7 @@ def test_lines_are_kept_where_they_hold(cartpole: MpcController, monkeypatch: py
 def test_updates_equal_a_fresh_program(cartpole: MpcController) -> None:
     design, program = cartpole.design, cartpole.engine.program
     x = cartpole.draw(8, np.random.default_rng(5))[:1]
-    assert cartpole.successive.solve(cartpole.framed(x)[0], None)
+    assert cartpole.planner.solve(cartpole.framed(x)[0], None)
     fresh = Program(program.stages, design.section, design.rows, design.weights, design.tolerance, varying=True)
     fresh.begin(cartpole.framed(x)[0])
     program.begin(cartpole.framed(x)[0])

@@ -14,7 +14,8 @@ from tube_designs import drawn, mecanum, with_pieces
 
 from gapcert import UsageError, closed_loop
 from gapcert.testing.synthesis import Band, Rod, rod_problem
-from gapcert_mpc.controller import Engine, MpcController
+from gapcert_mpc.controller import MpcController
+from gapcert_mpc.planning.engine import Engine
 from gapcert_mpc.program.pieces import Pieces
 from gapcert_mpc.program.solver import SOLVERS, Osqp, QpSolver, solver
 from gapcert_mpc.program.tuning import tuned

@@ -18,10 +18,11 @@ from gapcert.testing.synthesis import Band, rod_problem, rod_reach_avoid
 from gapcert_mpc.config import MpcConfig, Terminal
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.inscribed import Sums, inscribed
+from gapcert_mpc.planning.design import Ends
+from gapcert_mpc.planning.terminal_boxes import Landing
 from gapcert_mpc.synthesizer import Mpc
 from gapcert_mpc.variants import terminal
 from gapcert_mpc.variants.terminal import HandedController, lost
-from gapcert_mpc.variants.terminal_boxes import Ends, Landing
 
 Array = np.ndarray
 GAP = Band((-1.5e-4, -6e-5), (1.5e-4, 6e-5))
@@ -182,7 +183,7 @@ def test_without_the_tube_at_the_end_the_promise_breaks() -> None:
     """Plans whose centre alone ends in a box come out of the winning set under the corners of the gap."""
     controller = fresh(made())
     wide = controller.plans.engine.program.constant[-1] @ controller.design.section.support[:2].T
-    landing = controller.plans.engine.arrival
+    landing = controller.plans.planner
     assert isinstance(landing, Landing)
     landing.boxes = landing.boxes + np.array([[-1.0], [1.0]]) * wide
     x = on_the_edge(controller, 40)

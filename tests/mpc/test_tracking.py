@@ -17,9 +17,9 @@ from gapcert.testing.synthesis import Band, Rod, rod_problem, rod_reach_avoid
 from gapcert_closed_loop.closed_loop import compare_loops
 from gapcert_figures.data import Figures, loop_figure
 from gapcert_mpc.controller import MpcController
+from gapcert_mpc.planning.tracking import Course
 from gapcert_mpc.program.solver import Piqp
 from gapcert_mpc.synthesizer import Mpc
-from gapcert_mpc.tracking import Course
 from gapcert_report.pictures.experiment import wanted_pictures
 
 Array = np.ndarray

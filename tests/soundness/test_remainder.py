@@ -24,7 +24,7 @@ from gapcert_bounds.families.multilinear import MultilinearGap
 from gapcert_bounds.families.piecewise_envelope import PiecewiseEnvelope
 from gapcert_calibrate.route import CalibratedGap
 from gapcert_functions.dominating import dominate
-from gapcert_mpc.saved.saved_models import NotKept, again, kept, pair
+from gapcert_mpc.saved_models import NotKept, again, kept, pair
 
 Array = np.ndarray
 

@@ -8,7 +8,7 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from gapcert_mpc.controller import Design
+from gapcert_mpc.planning.design import Design
 
 Array = np.ndarray
 

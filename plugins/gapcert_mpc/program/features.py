@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import scipy.linalg
@@ -10,7 +11,7 @@ import scipy.linalg
 from gapcert import Array, Domain, Interval
 from gapcert.plugin import majorant_of
 
-from .linearise import Frame, Nominal, Stages, tiles
+from .linearise import Frame, Nominal, Stages, in_frame, tiles
 from .tube import Section, searched
 
 NEAR = 0.1  # plans are mostly so near, in half-ranges, to where majorants are centred
@@ -23,34 +24,26 @@ def featured(nominal: Nominal, zone: Domain, horizon: int, frame: Frame, constan
     relative ones, d = u − v say. With d bounded by itself, fast motion at d = 0 is as certain as rest.
     """
     low, high = zone.low, zone.high
-    box = Interval(low[None], high[None])
-    centre = box.mid
-    slope = nominal.slopes(box).mid[0]
-    line, start = Interval.exact(slope), nominal.enclosed(Interval.exact(centre))
+    centre, slope, left_out = nominal.line(low, high)
     relative = getattr(nominal.gap, "relative", None)
 
     def wrong(cells: Interval) -> Interval:
-        # Mean value form about each cell's own centre c: F(z) − F(ẑ) − J(z − ẑ) is that at c, plus (F′(cell) − J)(z − c).
-        middle = Interval.exact(cells.mid)
-        at = nominal.enclosed(middle) - start - (line * (middle - centre)[:, None, :]).sum(-1)
-        mean = at + ((nominal.slopes(cells) - line) * (cells - middle)[:, None, :]).sum(-1)
-        return mean if relative is not None else mean + nominal.left(cells)
+        return left_out(cells) if relative is not None else left_out(cells) + nominal.left(cells)
 
-    parts = [(*_bounded(wrong, zone, centre[0], constant), np.eye(len(low)))]
+    parts = [(*_bounded(wrong, zone, centre, constant), np.eye(len(low)))]
     if relative is not None:
         C = np.eye(len(low))
         C[nominal.nx :] = np.hstack([np.asarray(relative.slope), np.diag(relative.scale)])
         left = nominal.gap.inner.remainder_over  # type: ignore[union-attr]
-        parts.append((*_bounded(left, relative.domain(zone), C @ centre[0], constant), C))
+        parts.append((*_bounded(left, relative.domain(zone), C @ centre, constant), C))
     shift, c = (np.sum([p[i] for p in parts], axis=0) for i in (0, 1))
     G, F = np.hstack([p[2] for p in parts]), np.vstack([p[3] for p in parts]) * frame.half
     used = G.any(axis=0)
     size = np.abs(F[used]).max(axis=1)
-    middle, half = frame.x
-    n, J, zeta = frame.nx, slope * frame.half / half[:, None], frame.into(centre[0])
-    d = (nominal(centre)[0] + shift - middle) / half - J @ zeta
-    rows = J[:, :n], J[:, n:], d, c / half, G[:, used] * size / half[:, None], zeta, frame.into(low), frame.into(high)
-    return Stages(*(a[None] for a in rows)).repeated(horizon + 1), F[used] / size[:, None]
+    units = slope, nominal(centre[None])[0] + shift, c, np.zeros_like(slope)
+    one = in_frame(frame, *(a[None] for a in units), *(frame.into(a)[None] for a in (centre, low, high)))
+    one = replace(one, G=(G[:, used] * size / frame.x[1][:, None])[None])
+    return one.repeated(horizon + 1), F[used] / size[:, None]
 
 
 def _bounded(error: Callable[[Interval], Interval], zone: Domain, centre: Array, constant: bool) -> tuple[Array, Array, Array]:
@@ -82,13 +75,14 @@ def grown(closed: Array, rows: Array, c: Array, G: Array, whole: Array, steps: i
     return np.asarray(total[: len(rows)])
 
 
-def passing(A: Array, B: Array, c: Array, G: Array, F: Array, rows: Array, steps: int) -> Section:
-    """The section whose tube leaves most of the rows (r, n + m), each scaled to 1, after so many steps; it need not shrink.
+def passing(stages: Stages, F: Array, rows: Array) -> Section:
+    """The section whose tube leaves most of the rows (r, n + m), each scaled to 1, at the horizon; it need not shrink.
 
     Linear-quadratic regulators are tried as `tube.tightest` does, by what a tube needs at least and then by what their sections
     need, with a weight on each of F (f, n + m) as well: a feedback that leaves what the uncertainty depends on alone may be
     worth more than one that contracts.
     """
+    (A, B, c, G), steps = stages.first, stages.horizon
     n, m = B.shape
 
     def gain(logs: Array) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import final
 
@@ -68,6 +69,11 @@ class Stages:
     def horizon(self) -> int:
         return len(self.A) - 1
 
+    @property
+    def first(self) -> tuple[Array, Array, Array, Array]:
+        """(A, B, c, G) of the first of them, which a tube is made for."""
+        return self.A[0], self.B[0], self.c[0], self.G[0]
+
     def repeated(self, count: int) -> Stages:
         """The first of them `count` times."""
         return self.taken(np.zeros(count, dtype=np.int64))
@@ -127,16 +133,10 @@ class Nominal:
         What it leaves out is bounded by a constant, or by a function that is affine in |z − ẑ| as well: the least on average;
         cut: over cells that are cut where that pays, else over those of `tiles`.
         """
-        box = Interval(low[None], high[None])
-        centre = box.mid
-        line = Interval.exact(self.slopes(box).mid[0])
-        start = self.enclosed(Interval.exact(centre))
+        centre, slope, left_out = self.line(low, high)
 
         def wrong(cells: Interval) -> Interval:
-            # Mean value form about each cell's own centre c: F(z) − F(ẑ) − J(z − ẑ) is that at c, plus (F′(cell) − J)(z − c).
-            middle = Interval.exact(cells.mid)
-            at = self.enclosed(middle) - start - (line * (middle - centre)[:, None, :]).sum(-1)
-            return at + ((self.slopes(cells) - line) * (cells - middle)[:, None, :]).sum(-1) + self.left(cells)
+            return left_out(cells) + self.left(cells)
 
         cells = tiles(low, high)
         over = wrong(cells)
@@ -146,14 +146,28 @@ class Nominal:
         c, G = (over - shift).mag.max(axis=0), np.zeros((self.nx, len(low)))
         if not (constant or cut) and np.isfinite(c).all():
             # Imported by name it would be the module of this name to the import contracts.
-            c, G = gapcert.plugin.majorant((over - shift).mag, cells.lo, cells.hi, centre[0])
+            c, G = gapcert.plugin.majorant((over - shift).mag, cells.lo, cells.hi, centre)
         elif not constant and np.isfinite(c).all():
-            c, G = majorant_of(lambda cells: (wrong(cells) - shift).mag, low, high, centre[0], CELLS // 4)
-        value = self(centre)[0] + shift
-        one = _in_frame(
-            frame, *(a[None] for a in (line.mid, value, c, G)), *(frame.into(a)[None] for a in (centre[0], low, high))
-        )
+            c, G = majorant_of(lambda cells: (wrong(cells) - shift).mag, low, high, centre, CELLS // 4)
+        units = slope, self(centre[None])[0] + shift, c, G
+        one = in_frame(frame, *(a[None] for a in units), *(frame.into(a)[None] for a in (centre, low, high)))
         return one.repeated(horizon + 1)
+
+    def line(self, low: Array, high: Array) -> tuple[Array, Array, Callable[[Interval], Interval]]:
+        """(ẑ (nz,), J (nx, nz), e): the middles of a box and of ∂F/∂z over it; e(cells) contains F(z) − F(ẑ) − J(z − ẑ).
+
+        Mean value form about each cell's own centre c: that is what it is at c, plus (F′(cell) − J)(z − c).
+        """
+        box = Interval(low[None], high[None])
+        centre, slope = box.mid, self.slopes(box).mid[0]
+        line, start = Interval.exact(slope), self.enclosed(Interval.exact(centre))
+
+        def left_out(cells: Interval) -> Interval:
+            middle = Interval.exact(cells.mid)
+            at = self.enclosed(middle) - start - (line * (middle - centre)[:, None, :]).sum(-1)
+            return at + ((self.slopes(cells) - line) * (cells - middle)[:, None, :]).sum(-1)
+
+        return centre[0], slope, left_out
 
     def along(self, frame: Frame, z: Array, low: Array, high: Array) -> Stages:
         """A straight line about each point z (k, nz) of a motion, for its box [low, high] (k, nz), which contains it; all of
@@ -172,7 +186,7 @@ class Nominal:
         mean = sum((slopes[m] for m in range(1, PARTS)), slopes[0]) / PARTS
         left = self.left(Interval(at - below, at + above))
         value, error = self._at(at)
-        return _in_frame(frame, mean.mid, value + left.mid, left.rad + error, mean.rad, z, low, high)
+        return in_frame(frame, mean.mid, value + left.mid, left.rad + error, mean.rad, z, low, high)
 
     def tangents(self, frame: Frame, z: Array, low: Array, high: Array, c: Array) -> Stages:
         """The straight lines of F at points z (k, nz), with c (nx,), all in the frame: what they leave out is not bounded."""
@@ -181,7 +195,7 @@ class Nominal:
         if self.predictor is not None:
             J = J + self.predictor.jacobian_over(Interval.exact(at)).mid
         c = np.tile(c * frame.x[1], (len(z), 1))
-        return _in_frame(frame, J, self._at(at)[0], c, np.zeros_like(J), z, low, high)
+        return in_frame(frame, J, self._at(at)[0], c, np.zeros_like(J), z, low, high)
 
     def _at(self, z: Array) -> tuple[Array, Array]:
         """F(z) but for whole turns of angles, and what it may be wrong by: (k, nx) each."""
@@ -197,7 +211,7 @@ class Nominal:
         return after + known.mid, error + known.rad
 
 
-def _in_frame(frame: Frame, slope: Array, value: Array, c: Array, G: Array, zeta: Array, low: Array, high: Array) -> Stages:
+def in_frame(frame: Frame, slope: Array, value: Array, c: Array, G: Array, zeta: Array, low: Array, high: Array) -> Stages:
     """Stacks (k, …) in the units of the model, but for ζ and its box."""
     n = frame.nx
     middle, half = frame.x

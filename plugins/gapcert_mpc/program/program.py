@@ -13,8 +13,8 @@ import scipy.sparse as sp
 from gapcert import Array
 from gapcert.plugin import Ints
 
+from .constraints import Preferred
 from .linearise import Stages
-from .soft_constraints import Preferred
 from .solver import Piqp
 from .tube import Section
 
@@ -189,7 +189,10 @@ class Program:
         grown = sec.moved_by(st.A, st.B) + size @ st.G @ np.abs(self.F @ sec.feedback)
         spread = (size @ (st.c + eps)[..., None])[..., 0]
         self.grown, self.spread = grown, spread
-        self.constant = self._constant_tube(grown, spread)
+        # The tube where it does not depend on the plan, else 0 but for s₀.
+        self.constant = np.vstack([self.s0, np.zeros((N, self.p))])
+        if not self.variable:
+            self.constant = self.tube(np.zeros((N, len(self.F))))
         table, at = Table(), self.at
         self.start = table.rows(np.zeros((1, n)), np.zeros((1, n)))
         table.put("start", self.start, at["x"][:1], np.eye(n))
@@ -220,7 +223,7 @@ class Program:
 
     def _kept(self, table: Table, name: str, k: slice, take: Ints) -> None:
         """low ≤ W z ≤ high on the whole section of the stages k, for the rows W that are taken."""
-        n, at, W, grows = self.n, self.at, self.whole[take], self.grows[take]
+        at, W, grows = self.at, self.whole[take], self.grows[take]
         low, high = (bound[k][:, take] for bound in self.limits())
         if not self.variable or name == "first":
             self.off[k] += self.constant[k] @ self.grows.T
@@ -232,11 +235,14 @@ class Program:
             first = table.rows(least, most)
             for kept in {"within": (self.upper, self.lower), "above": (self.upper,), "below": (self.lower,)}[word]:
                 kept[k][:, take] = first[:, None] + np.arange(len(take))
-            table.put(f"{name}-{word}-x", first, at["x"][k], sign * W[:, :n])
-            if name != "last":
-                table.put(f"{name}-{word}-u", first, at["u"][k], sign * W[:, n:])
+            self._put(table, f"{name}-{word}", first, sign * W, at["x"][k], at["u"][k])
             if self.variable and name != "first":
                 table.put(f"{name}-{word}-s", first, at["s"][slice(k.start - 1, k.stop - 1)], grows)
+
+    def _put(self, table: Table, name: str, first: Ints, W: Array, x: Ints, u: Ints) -> None:
+        """W z, of the states and the inputs at these columns, in as many of the rows as there are of each."""
+        table.put(f"{name}-x", first[: len(x)], x, W[..., : self.n])
+        table.put(f"{name}-u", first[: len(u)], u, W[..., self.n :])
 
     def bound(self, low: Array, high: Array) -> None:
         """New bounds low, high (N+1, n+m+r) of what `whole` reads, at each stage that has rows; those of `final` stay."""
@@ -254,16 +260,8 @@ class Program:
             s[k + 1] = self.grown[k] @ s[k] + self.spread[k] + np.abs(self.section.H) @ self.stages.G[k] @ away[k]
         return s
 
-    def _constant_tube(self, grown: Array, spread: Array) -> Array:
-        """s (N+1, p) where it does not depend on the plan, else 0 but for s₀."""
-        s = np.zeros((self.N + 1, self.p))
-        s[0] = self.s0
-        for k in range(self.N if not self.variable else 0):
-            s[k + 1] = grown[k] @ s[k] + spread[k]
-        return s
-
     def _variable_tube(self, table: Table, grown: Array, spread: Array) -> None:
-        N, n, at, st, on = self.N, self.n, self.at, self.stages, self.on
+        N, at, st, on = self.N, self.at, self.stages, self.on
         F, M, q, eps = self.F[on], N + self.steady, len(on), self.tolerance
         first = np.vstack([grown[0] @ self.s0, np.zeros((N - 1, self.p))])
         tube = table.rows(spread[:N] + first + eps, np.full((N, self.p), np.inf))
@@ -276,11 +274,9 @@ class Program:
             first = table.rows(-sign * st.centre[:M] @ F.T + eps, np.full((M, q), np.inf))
             self.sizes = np.concatenate([self.sizes, first])
             table.put(f"size-{word}", first, at["a"], np.eye(q))
-            table.put(f"size-{word}-x", first[:N], at["x"][:N], -sign * F[:, :n])
-            table.put(f"size-{word}-u", first[:N], at["u"], -sign * F[:, n:])
+            self._put(table, f"size-{word}", first, -sign * F, at["x"][:N], at["u"])
             if self.steady:
-                table.put(f"size-{word}-xs", first[N:], at["xs"], -sign * F[:, :n])
-                table.put(f"size-{word}-us", first[N:], at["us"], -sign * F[:, n:])
+                self._put(table, f"size-{word}-steady", first[N:], -sign * F, at["xs"], at["us"])
 
     def _invariant(self, M: Array, spread: Array, size: Array) -> tuple[Array, Array, Array]:
         """Terminal sizes σ = base + per · a_s + more · κ: base (p,), more (p, p), per (p, q)."""
@@ -299,8 +295,7 @@ class Program:
         table.put("steady-x", steady, at["xs"], np.eye(n) - st.A[N:])
         table.put("steady-u", steady, at["us"], -st.B[N:])
         ends = table.rows(np.full((2, len(whole)), -np.inf), np.vstack([high[N], -low[N]]) - eps - grows @ base)
-        table.put("set-x", ends, np.repeat(at["xs"], 2), sides * whole[:, :n])
-        table.put("set-u", ends, np.repeat(at["us"], 2), sides * whole[:, n:])
+        self._put(table, "set", ends, sides * whole, np.repeat(at["xs"], 2), np.repeat(at["us"], 2))
         table.put("set-size", ends, np.repeat(at["size"], 2), grows @ more)
         positive = table.rows(np.zeros((1, p)), np.full((1, p), np.inf))
         table.put("positive", positive, at["size"], np.eye(p))
@@ -361,10 +356,8 @@ class Program:
             least[N, soft.axis >= n] = -np.inf
             first = table.rows(least, np.full_like(least, np.inf))
             table.put(f"soft-{word}", first, slack, np.eye(q))
-            table.put(f"soft-{word}-x", first[: N + 1], at["x"], -sign * W[:, :n])
-            table.put(f"soft-{word}-u", first[:N], at["u"], -sign * W[:, n:])
-            table.put(f"soft-{word}-xs", first[N + 1 :], at["xs"], -sign * W[:, :n])
-            table.put(f"soft-{word}-us", first[N + 1 :], at["us"], -sign * W[:, n:])
+            self._put(table, f"soft-{word}", first, -sign * W, at["x"], at["u"])
+            self._put(table, f"soft-{word}-steady", first[N + 1 :], -sign * W, at["xs"], at["us"])
         table.put("soft-positive", table.rows(np.zeros((N + 1, q)), np.full((N + 1, q), np.inf)), at["e"], np.eye(q))
 
     def limits(self) -> tuple[Array, Array]:
@@ -375,8 +368,8 @@ class Program:
             np.hstack([st.high, np.broadcast_to(np.minimum(self.rows.high, LOOSE), shape)]),
         )
 
-    def target(self, x: Array, u: Array, weights: Array) -> tuple[Array, Array] | None:
-        """The steady pair whose terminal set keeps all rows, nearest to (x, u) in |weights · ·|; None where there is none."""
+    def target(self, z: Array, weights: Array) -> Array | None:
+        """The steady pair (n + m,) whose terminal set keeps all rows, nearest to z in |weights · ·|, if there is one."""
         at, n, m = self.at, self.n, self.m
         columns = np.concatenate([np.arange(at[k][-1], at[k][-1] + w) for k, w in (("xs", n), ("us", m), ("size", self.p))])
         kept = self.final
@@ -387,9 +380,9 @@ class Program:
             kept = np.concatenate([kept, self.sizes[self.N] + np.arange(q), last])
         A = self.A[kept][:, columns]
         goal, weight = np.zeros(len(columns)), np.full(len(columns), 1e-9)
-        goal[: n + m], weight[: n + m] = np.concatenate([x, u]), np.maximum(weights, 1e-6)
+        goal[: n + m], weight[: n + m] = z, np.maximum(weights, 1e-6)
         found = Piqp(sp.diags(weight, format="csc"), -weight * goal, A, self.low[kept], self.high[kept], 1e-8).solve()
-        return (found.z[:n], found.z[n : n + m]) if found.status == "solved" else None
+        return found.z[: n + m] if found.status == "solved" else None
 
     # -- cost -------------------------------------------------------------------------------------------------------------
 

@@ -12,6 +12,7 @@ from gapcert import Array, MissingDependency, UsageError
 
 Name = Literal["osqp", "piqp", "clarabel"]
 Choice = Literal["auto", "osqp", "piqp", "clarabel"]
+Status = Literal["solved", "infeasible", "unfinished"]
 FREE = 1e20
 
 
@@ -21,7 +22,7 @@ class Answer(NamedTuple):
 
     z: Array
     y: Array
-    status: Literal["solved", "infeasible", "unfinished"]
+    status: Status
     iterations: int
 
 
@@ -32,6 +33,8 @@ class QpSolver(ABC):
     """
 
     name: Name
+    solved: Any
+    bad: tuple[Any, ...]
 
     @abstractmethod
     def __init__(self, P: sp.csc_matrix, q: Array, A: sp.csc_matrix, low: Array, high: Array, tolerance: float) -> None: ...
@@ -46,12 +49,17 @@ class QpSolver(ABC):
     def solve(self, z: Array | None = None, y: Array | None = None) -> Answer:
         """From the guess (z, y) where the method can use one: a pure function of the data and the guess."""
 
+    def _answer(self, z: Any, y: Array, found: Any, iterations: Any) -> Answer:
+        """Of what the library calls `solved` and, where there is no answer, `bad`."""
+        status: Status = "solved" if found == self.solved else "infeasible" if found in self.bad else "unfinished"
+        return Answer(np.array(z), y, status, int(iterations))
+
 
 @final
 class Osqp(QpSolver):
     """Operator splitting [Stellato et al., 2020]: the fastest from a good guess."""
 
-    name = "osqp"
+    name, solved, bad = "osqp", 1, (3, 4)
     MOST = 60  # beyond it an interior point method is sooner there
 
     def __init__(
@@ -85,9 +93,7 @@ class Osqp(QpSolver):
         if z is not None:
             self.osqp.warm_start(x=z, y=y)
         found = self.osqp.solve(raise_error=False)
-        value = found.info.status_val
-        status = "solved" if value == 1 else "infeasible" if value in (3, 4) else "unfinished"
-        return Answer(found.x, found.y, status, found.info.iter)  # type: ignore[arg-type]
+        return self._answer(found.x, found.y, found.info.status_val, found.info.iter)
 
 
 @final
@@ -138,8 +144,7 @@ class Piqp(QpSolver):
         dual = np.zeros(len(self.low))
         dual[self.equal] = r.y
         dual[self.rest] = r.z_u - r.z_l
-        status = "solved" if found == self.solved else "infeasible" if found in self.bad else "unfinished"
-        return Answer(np.array(r.x), dual, status, int(r.info.iter))  # type: ignore[arg-type]
+        return self._answer(r.x, dual, found, r.info.iter)
 
 
 @final
@@ -192,8 +197,7 @@ class Clarabel(QpSolver):
         k = len(dual) - e
         dual[self.equal] = got[:e]
         dual[~self.equal] = got[e : e + k] - got[e + k :]
-        status = "solved" if found.status == self.solved else "infeasible" if found.status in self.bad else "unfinished"
-        return Answer(np.array(found.x), dual, status, int(found.iterations))  # type: ignore[arg-type]
+        return self._answer(found.x, dual, found.status, found.iterations)
 
 
 def _library(name: str) -> Any:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections import OrderedDict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple, final
@@ -15,15 +14,18 @@ import numpy as np
 from gapcert import Array, Controller, Goal, Interval, SynthesisProblem
 from gapcert.plugin import Bools, Ints, Policy
 from gapcert_cells import write_saved
-from gapcert_mpc.controller import MpcController
+from gapcert_mpc.controller import MpcController, loaded
+from gapcert_mpc.planning.plans import Memory
 from gapcert_mpc.program.linearise import Nominal
-from gapcert_mpc.saved.saved_models import pair
+from gapcert_mpc.saved_models import known, pair
+from gapcert_mpc.task import Task
 
 from .membership import Membership
 from .parameters import Family
 
 Key = tuple[tuple[int, int, int], ...]
-MOST = 1 << 16
+Maker = Callable[[SynthesisProblem, MpcController | None], MpcController]
+"""Of the controller for one box of parameters, in what it need not find again like another."""
 SHARES = 8  # per width of a level, to which its box is rounded outwards
 
 
@@ -49,39 +51,22 @@ class Levels:
     that runs which have learned the same share a controller, and nothing depends on the order of what was asked.
     """
 
-    def __init__(self, family: Family, options: Mapping[str, Any], depth: int) -> None:
-        self.family, self.options, self.depth = family, options, depth
+    def __init__(self, family: Family, options: Mapping[str, Any], depth: int, make: Maker) -> None:
+        self.family, self.options, self.depth, self.make = family, options, depth, make
         self.first: Key = ((0, 0, SHARES),) * len(family.parameters)
         self.made: dict[Key, MpcController] = {}
 
     def __getitem__(self, key: Key) -> MpcController:
         if key not in self.made:
             like = None if key == self.first else self[self.first]
-            self.made[key] = self._make(self.family.within(self.box(key)), like)
+            self.made[key] = self.make(self.family.within(self.box(key)), like)
         return self.made[key]
 
-    def _make(self, problem: SynthesisProblem, like: MpcController | None) -> MpcController:
-        # A controller that is loaded and has nothing to learn needs no synthesizer.
-        from gapcert_mpc.synthesizer import Mpc
-
-        return Mpc(**self.options).for_box(problem, like)
-
     def told(self) -> dict[str, Any]:
-        """What `again` needs besides the problem, JSON-able."""
+        """What they are made by besides the problem, JSON-able."""
         ends = zip(self.family.range.lo.tolist(), self.family.range.hi.tolist(), strict=True)
         ranges = dict(zip(self.family.names, map(list, ends), strict=True))
         return {"range": ranges, "levels": self.depth, "options": dict(self.options)}
-
-    @classmethod
-    def again(cls, known: Mapping[str, Any], goal: Goal, told: Mapping[str, Any]) -> Levels:
-        """None of them is made yet."""
-        problem = SynthesisProblem(known["model"], known["gap"], known["domain"], goal, known["seed"])
-        return cls(Family.of(problem, told["range"]), told["options"], told["levels"])
-
-    def begun(self, first: MpcController) -> AdaptiveMpcController:
-        """With the controller for the whole range, which has been made."""
-        self.made[self.first] = first
-        return AdaptiveMpcController(first.goal, self, first.evidence)
 
     def box(self, key: Key) -> Interval:
         """Θ of a level, (nθ,)."""
@@ -100,15 +85,10 @@ class Levels:
             return now
         for j, level in enumerate(np.maximum(levels, [old for old, _, _ in now]).tolist()):
             pitch = (whole.hi[j] - whole.lo[j]) / SHARES / 2.0**level
-            first, last = (
-                int(np.floor((theta.lo[j] - whole.lo[j]) / pitch)),
-                int(np.ceil((theta.hi[j] - whole.lo[j]) / pitch)),
-            )
-            first, last = (
-                int(first - (whole.lo[j] + pitch * first > theta.lo[j])),
-                int(last + (whole.lo[j] + pitch * last < theta.hi[j])),
-            )
-            out.append((level, max(first, 0), min(last, SHARES << level)))
+            first, last = np.floor((theta.lo[j] - whole.lo[j]) / pitch), np.ceil((theta.hi[j] - whole.lo[j]) / pitch)
+            # Outwards, whatever was rounded.
+            first, last = first - (whole.lo[j] + pitch * first > theta.lo[j]), last + (whole.lo[j] + pitch * last < theta.hi[j])
+            out.append((level, max(int(first), 0), min(int(last), SHARES << level)))
         return tuple(out)
 
 
@@ -126,8 +106,7 @@ class AdaptiveMpcController(Controller):
     levels: Levels
     evidence: Mapping[str, Any]
     kind: str = "mpc"
-    runs: OrderedDict[int, Held] = field(default_factory=OrderedDict, repr=False)
-    counts: dict[str, int] = field(default_factory=dict, repr=False)
+    runs: Memory[Held] = field(default_factory=Memory, repr=False)
 
     @property
     def first(self) -> MpcController:
@@ -137,13 +116,6 @@ class AdaptiveMpcController(Controller):
     @property
     def policies(self) -> tuple[Policy, ...]:
         return self.first.policies
-
-    def _added(self, held: Held) -> int:
-        self.counts["last"] = last = self.counts.get("last", 0) + 1
-        self.runs[last] = held
-        if len(self.runs) > MOST:
-            self.runs.popitem(last=False)
-        return last
 
     def contains(self, x: Array) -> Bools:
         return self.first.contains(x)
@@ -158,32 +130,28 @@ class AdaptiveMpcController(Controller):
     def start(self, x: Array) -> Ints:
         """The number of what a run holds that begins there, with all of Θ₀; 0 where none can."""
         x = np.atleast_2d(np.asarray(x, dtype=np.float64))
-        numbers, key = self.first.start(x), self.levels.first
-        made = [
-            self._added(Held(key, n, self.levels.family.range, row)) if n else 0
-            for row, n in zip(x, numbers.tolist(), strict=True)
-        ]
-        return np.array(made, dtype=np.int64)
+        key, whole = self.levels.first, self.levels.family.range
+        numbers = zip(x, self.first.start(x).tolist(), strict=True)
+        return np.array([self.runs.add(Held(key, n, whole, row)) if n else 0 for row, n in numbers], dtype=np.int64)
 
     def advance(self, x: Array, memory: Ints) -> Ints:
         x = np.atleast_2d(np.asarray(x, dtype=np.float64))
-        out = np.zeros(len(x), dtype=np.int64)
-        rows = np.array([i for i, n in enumerate(memory.tolist()) if n in self.runs], dtype=np.int64)
-        if len(rows):
-            for i, held in zip(rows.tolist(), self._learned(x[rows], memory[rows]), strict=True):
-                out[i] = self._added(self._planned(x[i], held))
+        out, rows = np.zeros(len(x), dtype=np.int64), [*self._held(memory)]
+        for i, held in zip(rows, self._learned(x[rows], memory[rows]) if rows else (), strict=True):
+            out[i] = self.runs.add(self._planned(x[i], held))
         return out
+
+    def _held(self, memory: Ints) -> dict[int, Held]:
+        """Of the rows whose runs are known."""
+        return {i: held for i, held in enumerate(self.runs.of(memory)) if held is not None}
 
     def _learned(self, after: Array, memory: Ints) -> list[Held]:
         """What the step to `after` says of Θ."""
-        held = [self.runs[n] for n in memory.tolist()]
+        held = [*self._held(memory).values()]
         x = np.array([h.x for h in held])
-        theta = Interval(np.array([h.theta.lo for h in held]), np.array([h.theta.hi for h in held]))
-        new, refuted = Membership(self.levels.family).updated(x, self.respond(x, memory, "first"), after, theta)
-        out = []
-        for i, h in enumerate(held):
-            out.append(h if h.refuted else h._replace(theta=new[i], refuted=bool(refuted[i])))
-        return out
+        u, theta = self.respond(x, memory, "first"), self.theta(memory)
+        new, refuted = Membership(self.levels.family).updated(x, u, after, theta)
+        return [h if h.refuted else h._replace(theta=new[i], refuted=bool(refuted[i])) for i, h in enumerate(held)]
 
     def _planned(self, x: Array, held: Held) -> Held:
         """A plan for the level of Θ, else what goes on at the level of before."""
@@ -199,7 +167,7 @@ class AdaptiveMpcController(Controller):
 
     def _grouped(self, memory: Ints) -> Iterator[tuple[MpcController, Ints, Ints]]:
         """(controller, rows, their memory there), level by level."""
-        held = {i: h for i, n in enumerate(memory.tolist()) if (h := self.runs.get(n)) is not None}
+        held = self._held(memory)
         for key in dict.fromkeys(h.key for h in held.values()):
             rows = [i for i, h in held.items() if h.key == key]
             yield self.levels[key], np.array(rows), np.array([held[i].number for i in rows])
@@ -212,7 +180,7 @@ class AdaptiveMpcController(Controller):
 
     def respond(self, x: Array, memory: Ints, policy: Policy, seed: int = 0, k: int = 0) -> Array:
         x = np.atleast_2d(np.asarray(x, dtype=np.float64))
-        if any(n not in self.runs for n in memory.tolist()):
+        if len(self._held(memory)) < len(memory):
             # What is told of a state outside the domain is told by the first level.
             return self.first.respond(x, np.zeros(len(x), dtype=np.int64), policy, seed, k)
         out = np.empty((len(x), self.levels.family.problem.model.nu))
@@ -232,7 +200,7 @@ class AdaptiveMpcController(Controller):
 
     def fallbacks(self, memory: Ints) -> Ints:
         """(n,): steps of each run that went on with a plan of before."""
-        return np.array([self.runs[n].shifted if n in self.runs else 0 for n in memory.tolist()], dtype=np.int64)
+        return np.array([0 if held is None else held.shifted for held in self.runs.of(memory)], dtype=np.int64)
 
     def predicted(self, x: Array, memory: Ints | None = None) -> tuple[Array, Array, Array] | None:
         """As the controller of the run's level has it; it holds for all of the level's box."""
@@ -242,20 +210,20 @@ class AdaptiveMpcController(Controller):
 
     def theta(self, memory: Ints) -> Interval:
         """Θ of each run, (n, nθ)."""
-        held = [self.runs[n].theta for n in memory.tolist()]
+        held = [h.theta for h in self._held(memory).values()]
         return Interval(np.array([t.lo for t in held]), np.array([t.hi for t in held]))
 
     def learned(self, memory: Ints) -> dict[str, Array]:
         """Θ of each run by name, (n, 2); NaN from where it was refuted. A run that has not begun knows the whole range."""
         whole, out = self.levels.family.range, np.empty((len(memory), len(self.levels.family.names), 2))
-        for i, held in enumerate(self.runs.get(n) for n in memory.tolist()):
+        for i, held in enumerate(self.runs.of(memory)):
             theta = whole if held is None else held.theta
             out[i] = np.nan if held is not None and held.refuted else np.stack([theta.lo, theta.hi], axis=1)
         return {name: out[:, j] for j, name in enumerate(self.levels.family.names)}
 
     def told(self, number: int) -> dict[str, Any]:
         """What a run has learned: Θ by name, the box of its plan's level, and a sentence where the claim was refuted."""
-        held, names = self.runs[number], self.levels.family.names
+        held, names = self.runs.kept[number], self.levels.family.names
 
         def shown(theta: Interval) -> dict[str, list[float]]:
             return {n: [float(a), float(b)] for n, a, b in zip(names, theta.lo, theta.hi, strict=True)}
@@ -287,26 +255,39 @@ class AdaptiveMpcController(Controller):
         parts = self.first.digest(), Nominal(problem.model, problem.gap).digest(), problem.domain.digest_data(), problem.seed
         return hashlib.sha256(json.dumps([*parts, self.levels.told()], sort_keys=True).encode()).hexdigest()
 
+    @classmethod
+    def load(cls, folder: Path | str, maker: Callable[[Mapping[str, Any]], Maker]) -> AdaptiveMpcController:
+        """Inverse of `save`, where it has what the others follow from; maker: makes of options who makes them."""
 
-def adaptive(problem: SynthesisProblem, asked: Mapping[str, Any], options: Mapping[str, Any], depth: int) -> Controller:
-    """For parameters in the ranges that are asked for; options: of the `Mpc` that makes the controller of one box of them, in
-    what it need not find again like that of the whole range.
+        def made(data: Mapping[str, Any], arrays: Mapping[str, Array]) -> AdaptiveMpcController:
+            of, told = known(data["kept"], arrays), data["adapt"]
+            problem = SynthesisProblem(of["model"], of["gap"], of["domain"], Goal.from_data(data["goal"]), of["seed"])
+            levels = Levels(Family.of(problem, told["range"]), told["options"], told["levels"], maker(told["options"]))
+            # The first controller's model is the one in the middle of the range.
+            own = levels.family.within(levels.family.range)
+            first = MpcController.read(Path(folder), data, arrays, Nominal(own.model, own.gap))
+            levels.made[levels.first] = first
+            return cls(first.goal, levels, first.evidence)
+
+        return loaded(folder, made)
+
+
+def adaptive(task: Task, make: Maker) -> Controller:
+    """For parameters in the ranges that are asked for.
 
     Without a gap the model is trusted as it is, at the middle of the ranges: nothing is learned then.
     """
-    levels = Levels(family := Family.of(problem, asked), options, depth)
-    if problem.gap is None:
-        return levels[levels.first]
-    if not (first := levels[levels.first]).wins:
+    problem, options = task.problem, task.options
+    levels = Levels(family := Family.of(problem, options.adapt), options.of_boxes, options.levels, make)
+    first = levels[levels.first]
+    if problem.gap is None or not first.wins:
         return first
-    names = ", ".join(
-        f"{p.name} in [{a:g}, {b:g}] {p.unit}"
-        for p, a, b in zip(family.parameters, family.range.lo, family.range.hi, strict=True)
-    )
+    ends = list(zip(family.parameters, family.range.lo.tolist(), family.range.hi.tolist(), strict=True))
+    names = ", ".join(f"{p.name} in [{low:g}, {high:g}] {p.unit}" for p, low, high in ends)
     assumptions = [
         *first.evidence.get("assumptions", ()),
         f"The plant's parameters are constant, with {names}.",
         "The gap holds around the model with the plant's own parameters, whatever they are in this range.",
     ]
-    ranges = {p.name: [float(a), float(b)] for p, a, b in zip(family.parameters, family.range.lo, family.range.hi, strict=True)}
+    ranges = {p.name: [low, high] for p, low, high in ends}
     return AdaptiveMpcController(problem.goal, levels, {**first.evidence, "adapt": ranges, "assumptions": assumptions})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -13,11 +14,14 @@ import numpy as np
 import scipy.linalg
 
 from gapcert import Array, Controller, Goal, UsageError
-from gapcert.plugin import Bools, Ints, Policy
+from gapcert.plugin import Bools
 from gapcert_cells import write_saved
-from gapcert_mpc.controller import Design, MpcController
-from gapcert_mpc.plans import Memory
+from gapcert_mpc.controller import MpcController, PlanController, loaded
+from gapcert_mpc.planning.design import Design
+from gapcert_mpc.planning.plans import Memory
+from gapcert_mpc.task import Task
 
+from .regulation import regulating
 from .sls import SlsSolver
 from .sls_problem import LtvProblem, SlsPlan
 
@@ -38,6 +42,10 @@ class Run(NamedTuple):
     past: Array
     shifted: int
     sound: bool
+
+    @property
+    def age(self) -> int:
+        return len(self.past)
 
 
 @final
@@ -149,12 +157,11 @@ class Responses:
 
 
 @final
-class DisturbanceMpcController(Controller):
-    """MPC whose plans answer disturbances: contains a state if one begins there; a run's memory is the number of its `Run`.
+class DisturbanceMpcController(PlanController[Run]):
+    """MPC whose plans answer disturbances.
 
-    A plan is a certificate by itself: where a solve is refused, the run goes on with its plan, whose inputs follow from the
-    disturbances since then, as states have shown them, and after its end with the terminal set's feedback. `fixed` is the
-    controller with a fixed gain of the same design, which has all that both share.
+    Where a solve is refused, the inputs of what is left of a plan follow from the disturbances since it was made, as states
+    have shown them. `fixed` is the controller with a fixed gain of the same design, which has all that both share.
     """
 
     def __init__(self, fixed: MpcController) -> None:
@@ -169,119 +176,66 @@ class DisturbanceMpcController(Controller):
 
     @cached_property
     def responses(self) -> Responses:
-        return Responses(self.design)
+        return Responses(self._design)
 
     @cached_property
-    def memory(self) -> Memory[Run]:
+    def memory(self) -> Memory[Run]:  # type: ignore[override]
         p = self.responses.solver.problem
         N, n, m = p.B.shape
         return Memory(max(1024, BYTES // (8 * (N + 1) * (n + m) * (1 + N * n))))
 
     @property
-    def policies(self) -> tuple[Policy, ...]:
-        return self.fixed.policies
-
-    @property
     def resolution(self) -> int:
         return self.fixed.resolution
-
-    def _next(self, x: Array, run: Run | None) -> Run | None:
-        """A new plan from a state in the frame, or what is left of the one that is held."""
-        if (found := self.responses.solve(x, None if run is None else run.rows)) is not None:
-            return Run(*found, x, np.empty((0, len(x))), run.shifted if run else 0, True)
-        if run is None:
-            return None
-        w = x - self._expected(run)
-        return Run(run.plan, run.rows, x, np.vstack([run.past, w]), run.shifted + 1, run.sound and self._bounded(w))
-
-    def _bounded(self, w: Array) -> bool:
-        return bool((np.abs(w) <= self.responses.radius).all())
-
-    def _expected(self, run: Run) -> Array:
-        """The next state where nothing disturbs, in the frame."""
-        made = self.responses
-        return np.asarray(made.A @ run.x + made.B @ self._input(run) + made.d)
-
-    def _input(self, run: Run) -> Array:
-        """In the frame."""
-        N, m = self.responses.N, self.responses.m
-        if (age := len(run.past)) < N:
-            return run.plan.input(age, run.past)[:m]
-        x, u, _ = self._ended(run)
-        return np.asarray(u + self.design.section.K @ (run.x - x))
-
-    def _ended(self, run: Run) -> tuple[Array, Array, Array]:
-        N = self.responses.N
-        return self.responses.target(run.plan.input(N, run.past[:N]))
-
-    def contains(self, x: Array) -> Bools:
-        return np.asarray(self.start(x) > 0)
 
     def draw(self, n: int, rng: np.random.Generator) -> Array:
         """As of every controller, of few at a time: a program is solved for each."""
         return super().draw(min(n, 64), rng)
 
-    def start(self, x: Array) -> Ints:
-        """The number of a run that begins there; 0 where there is no plan."""
-        return np.array([self.memory.begin(row, lambda x: self._next(x, None)) for row in self.fixed.framed(x)], dtype=np.int64)
-
-    def advance(self, x: Array, memory: Ints) -> Ints:
-        out = np.zeros(len(x), dtype=np.int64)
-        for i, (row, number) in enumerate(zip(self.fixed.framed(x), memory.tolist(), strict=True)):
-            if (run := self.memory[number]) is not None and (then := self._next(row, run)) is not None:
-                out[i] = self.memory.add(then)
-                self.counts["shifted" if len(then.past) else "solved"] += 1
-        return out
-
-    def keeps(self, x: Array, memory: Ints) -> Bools:
-        """(n,): is the run at x, and was every disturbance since its plan within its bounds?"""
-        runs = [self.memory[number] for number in memory.tolist()]
-        at = zip(self.fixed.framed(x), runs, strict=True)
-        return np.array([run is not None and run.sound and np.abs(row - run.x).max() <= ROUNDING for row, run in at], np.bool_)
-
-    def kept(self, x: Array, u: Array, after: Array, memory: Ints | None = None) -> Bools:
-        """(n,): was the step's disturbance within its bounds?"""
-        numbers = self.start(x) if memory is None else memory
-        out = np.zeros(len(after), dtype=np.bool_)
-        for i, (row, number) in enumerate(zip(self.fixed.framed(after), numbers.tolist(), strict=True)):
-            run = self.memory[number]
-            out[i] = run is not None and run.sound and self._bounded(row - self._expected(run))
-        return np.asarray(out | self.over(after, numbers))
-
-    def respond(self, x: Array, memory: Ints, policy: Policy, seed: int = 0, k: int = 0) -> Array:
-        middle, half = self.design.frame.u
-        out = np.empty((len(x), len(half)))
-        for i, number in enumerate(memory.tolist()):
-            if (run := self.memory[number]) is None:
-                raise UsageError(
-                    f"controller: row {i}: no plan begins at {np.asarray(x)[i].tolist()}; ask `contains` before `act`"
-                )
-            out[i] = middle + half * self._input(run)
-        return out
-
-    def act(self, x: Array, policy: Policy = "first", seed: int = 0, k: int = 0) -> Array:
-        return self.respond(x, self.start(np.atleast_2d(x)), policy, seed, k)
-
-    def fallbacks(self, memory: Ints) -> Ints:
-        """(n,): steps of each run that went on with a plan of before, with the one that is about to be made."""
-        runs = [self.memory[number] for number in memory.tolist()]
-        return np.array([0 if run is None else run.shifted for run in runs], dtype=np.int64)
-
-    def predicted(self, x: Array, memory: Ints | None = None) -> tuple[Array, Array, Array] | None:
-        """x̄ after the disturbances so far, and the box of all that may follow; row 0 is x itself."""
-        numbers = self.start(x[None]) if memory is None else memory
-        if (run := self.memory[int(numbers[0])]) is None:
+    def _next(self, x: Array, held: Run | None) -> Run | None:
+        if (found := self.responses.solve(x, None if held is None else held.rows)) is not None:
+            return Run(*found, x, np.empty((0, len(x))), held.shifted if held else 0, True)
+        if held is None:
             return None
-        return self.fixed.foreseen(x, *self._foreseen(run))
+        w = x - self._expected(held)
+        return Run(held.plan, held.rows, x, np.vstack([held.past, w]), held.shifted + 1, held.sound and self._bounded(w))
 
-    def _foreseen(self, run: Run) -> tuple[Array, Array]:
-        """Centres and half-widths of the states from now on, in the frame."""
-        made, age, N = self.responses, len(run.past), self.responses.N
+    def _bounded(self, w: Array) -> bool:
+        return bool((np.abs(w) <= self.responses.radius).all())
+
+    def _expected(self, held: Run) -> Array:
+        """The next state where nothing disturbs, in the frame."""
+        made = self.responses
+        return np.asarray(made.A @ held.x + made.B @ self._input(held.x, held) + made.d)
+
+    def _input(self, x: Array, held: Run) -> Array:
+        """Of the state that the run is known to be at."""
+        N, m = self.responses.N, self.responses.m
+        if held.age < N:
+            return held.plan.input(held.age, held.past)[:m]
+        x_s, u_s, _ = self._ended(held)
+        return np.asarray(u_s + self._design.section.K @ (held.x - x_s))
+
+    def _ended(self, held: Run) -> tuple[Array, Array, Array]:
+        N = self.responses.N
+        return self.responses.target(held.plan.input(N, held.past[:N]))
+
+    def _held(self, x: Array, held: Run) -> bool:
+        """Is the run at x, and was every disturbance since its plan within its bounds?"""
+        return bool(held.sound and np.abs(x - held.x).max() <= ROUNDING)
+
+    def _stepped(self, u: Array, after: Array, held: Run) -> bool:
+        """Was the step's disturbance within its bounds?"""
+        return held.sound and self._bounded(after - self._expected(held))
+
+    def _foreseen(self, held: Run) -> tuple[Array, Array]:
+        """x̄ after the disturbances so far, and the box of all that may follow."""
+        made, age, N = self.responses, held.age, self.responses.N
         if age >= N:
-            x, _, size = self._ended(run)
-            return np.array([run.x, x]), np.array([np.zeros(len(x)), np.abs(made.section.P) @ size])
-        ahead = run.plan.state_response[age : N + 1]
-        centre = run.plan.x[age : N + 1] + np.einsum("kjab,jb->ka", ahead[:, :age], run.past)
+            x, _, size = self._ended(held)
+            return np.array([held.x, x]), np.array([np.zeros(len(x)), np.abs(made.section.P) @ size])
+        ahead = held.plan.state_response[age : N + 1]
+        centre = held.plan.x[age : N + 1] + np.einsum("kjab,jb->ka", ahead[:, :age], held.past)
         return centre, np.einsum("kjab,b->ka", np.abs(ahead[:, age:N]), made.radius)
 
     def digest(self) -> str:
@@ -291,15 +245,22 @@ class DisturbanceMpcController(Controller):
     def save(self, folder: Path | str) -> None:
         """Write `controller.npz` and `controller.json`."""
         told = {"feedback": "disturbance", "digest": self.digest()}
-        write_saved(Path(folder), self.fixed.saved() | told, self.design.arrays())
+        write_saved(Path(folder), self.fixed.saved() | told, self._design.arrays())
+
+    @classmethod
+    def load(cls, folder: Path | str) -> DisturbanceMpcController:
+        """Inverse of `save`."""
+        return loaded(folder, lambda data, arrays: cls(MpcController.read(Path(folder), data, arrays, None)))
 
 
-def answering(fixed: MpcController, starts: int, seed: int) -> Controller:
-    """The controller with feedback from disturbances of the same design; `fixed` itself where that wins nowhere."""
-    if fixed.design is None:
+def answering(task: Task) -> Controller:
+    """The controller with feedback from disturbances of the design that one gain has; that one itself where it wins nowhere."""
+    options = copy(task.options)
+    # What it bounds is a constant, and no quadratic program is solved.
+    options.majorant, options.starts = "constant", 1
+    if not (fixed := regulating(replace(task, options=options))).wins:
         return fixed
-    low, high = np.asarray(fixed.goal.stay.low), np.asarray(fixed.goal.stay.high)
-    x = low + (high - low) * np.random.default_rng(seed).random((starts, len(low)))
+    x = task.drawn(np.random.default_rng(task.problem.seed), task.options.starts)
     share = float(DisturbanceMpcController(fixed).contains(x).mean())
     told = dict(fixed.evidence) | {"feedback": "disturbance", "domain_fraction": share}
     return DisturbanceMpcController(replace(fixed, evidence=told))

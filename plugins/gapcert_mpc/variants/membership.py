@@ -35,7 +35,8 @@ class Membership:
         z, low, high = self._gap(x, u)
         known = self.family.problem.domain.zone.contains(z.mid)
         values = self.family.values(z, theta)
-        goal = self._goal(after, values, low, high)
+        # T, where f(z; θ*) lies.
+        goal = self._turned(after, values.mid) - Interval(low, high)
         rows = np.flatnonzero(known & ~goal.contains(values).all(axis=1))
         lo, hi, refuted = theta.lo.copy(), theta.hi.copy(), np.zeros(len(x), dtype=bool)
         if len(rows):
@@ -47,31 +48,22 @@ class Membership:
         """z, on the turn on which the gap is known, and l and u there."""
         domain, gap = self.family.problem.domain, self.family.problem.gap
         assert gap is not None, "without a gap nothing is to be learned"
-        z = np.hstack([x, u])
-        lo, hi = z.copy(), z.copy()
-        for j, axis in enumerate(domain.states.axes):
-            turns = np.round((z[:, j] - (domain.low[j] + domain.high[j]) / 2) / (2 * np.pi)) if axis.kind == "angle" else 0.0
-            moved = Interval.exact(z[:, j]) - TURN * turns
-            lo[:, j], hi[:, j] = np.where(turns != 0, moved.lo, z[:, j]), np.where(turns != 0, moved.hi, z[:, j])
-        boxes = Interval(lo, hi)
+        z, nx = np.hstack([x, u]), x.shape[1]
+        moved = self._turned(x, (domain.low[:nx] + domain.high[:nx]) / 2)
+        boxes = Interval(np.hstack([moved.lo, u]), np.hstack([moved.hi, u]))
         low, high = (np.array(end) for end in gap.interval(z))
-        turned = (lo < hi).any(axis=1)
+        turned = (boxes.lo < boxes.hi).any(axis=1)
         if turned.any():
             over = gap.interval_over(boxes[turned])
             low[turned], high[turned] = over.lo, over.hi
         return boxes, low, high
 
-    def _goal(self, after: Array, values: Interval, low: Array, high: Array) -> Interval:
-        """T (n, nx), where f(z; θ*) lies; angles on the turn that is nearest to what f gives."""
-        y = Interval.exact(after)
-        for j, s in enumerate(self.family.problem.model.states):
-            turns = np.round((after[:, j] - values.mid[:, j]) / (2 * np.pi)) if s.kind == "angle" else np.zeros(len(after))
-            if turns.any():
-                column = y[:, j] - TURN * turns
-                lo, hi = y.lo.copy(), y.hi.copy()
-                lo[:, j], hi[:, j] = np.where(turns != 0, column.lo, lo[:, j]), np.where(turns != 0, column.hi, hi[:, j])
-                y = Interval(lo, hi)
-        return y - Interval(low, high)
+    def _turned(self, x: Array, near: Array) -> Interval:
+        """States (n, nx), angles by the turn that is nearest to `near`."""
+        angles = np.array([s.kind == "angle" for s in self.family.problem.model.states])
+        turns = np.where(angles, np.round((x - near) / (2 * np.pi)), 0.0)
+        moved = Interval.exact(x) - TURN * turns
+        return Interval(np.where(turns != 0, moved.lo, x), np.where(turns != 0, moved.hi, x))
 
     def _cut(self, z: Interval, goal: Interval, theta: Interval) -> tuple[Interval, Bools]:
         """Hulls of what is left of the parts; a second time in those that are much smaller."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,19 +13,17 @@ import numpy as np
 
 from gapcert import Array, Context, Controller, Domain, Goal, Model, SynthesisProblem, UsageError, load_controller, registry
 from gapcert.plugin import Bools, Ints, Policy, Synthesizer
-from gapcert_cells import GridController, loading, write_saved
+from gapcert_cells import GridController, write_saved
 from gapcert_mpc.config import Terminal
-from gapcert_mpc.controller import Design, MpcController
+from gapcert_mpc.controller import MpcController, loaded
 from gapcert_mpc.inscribed import inscribed
-from gapcert_mpc.plans import Held, Plan
+from gapcert_mpc.planning.design import Design, Ends
+from gapcert_mpc.planning.plans import Held, Plan
+from gapcert_mpc.planning.successive import steady
 from gapcert_mpc.program.features import featured, passing
-from gapcert_mpc.program.linearise import Frame, Nominal, Stages
-from gapcert_mpc.program.program import Rows, Weights
-from gapcert_mpc.program.solver import Choice
-from gapcert_mpc.program.tube import unreached
-
-from .successive import steady
-from .terminal_boxes import Ends
+from gapcert_mpc.program.linearise import Frame, Stages
+from gapcert_mpc.program.program import Weights
+from gapcert_mpc.task import Task
 
 SMALL = 0.05  # of each range: a tube that takes less is not worth the variables that follow γ
 EDGE = 1e-9  # of half-ranges: a cell does not contain its upper edges, and coordinates are rounded
@@ -162,15 +160,14 @@ class HandedController(Controller):
 
     def _left(self, memory: Ints) -> Ints:
         """(n,): steps of its plan that a run has yet to make; at 0 it is in the hands of `then`. −1: there is no plan."""
-        held = [self.plans.memory[n] for n in memory.tolist()]
+        held = self.plans.memory.of(memory)
         return np.array([-1 if h is None else max((h.plan.arrival or 0) - h.age, 0) for h in held], dtype=np.int64)
 
     def start(self, x: Array) -> Ints:
         x = np.atleast_2d(np.asarray(x, dtype=np.float64))
         numbers, won = self.plans.start(x), self.then.contains(x)
-        for i in np.flatnonzero(numbers == 0).tolist():
-            if won[i]:
-                numbers[i] = self.plans.memory.add(Held(self._none))
+        for i in np.flatnonzero((numbers == 0) & won).tolist():
+            numbers[i] = self.plans.memory.add(Held(self._none))
         return numbers
 
     def contains(self, x: Array) -> Bools:
@@ -232,103 +229,68 @@ class HandedController(Controller):
     def save(self, folder: Path | str) -> None:
         """As a controller of plans, and `then` in the folder `terminal` there."""
         folder = Path(folder)
-        data = {"format": 1, "kind": self.kind, "goal": self.goal.to_data(), "evidence": dict(self.evidence)}
-        data |= {"solver": self.plans.solver, "terminal": self.policy, "digest": self.digest()}
+        told = {"terminal": self.policy, "digest": self.digest()}
         self.then.save(folder / "terminal")
-        write_saved(folder, data, self.design.arrays())
+        write_saved(folder, replace(self.plans, evidence=self.evidence).saved() | told, self.design.arrays())
 
     @classmethod
-    def load(cls, folder: Path | str) -> Controller:
-        """Inverse of `save`, and of that of a controller whose plans end around a steady pair."""
-        folder = Path(folder)
-        with loading(folder) as (data, arrays):
-            if "terminal" not in data:
-                return MpcController.load(folder)
-            then = load_controller(folder / "terminal")
-            design = Design.of({k: arrays[k] for k in arrays.files})
-            plans = MpcController(Goal.from_data(data["goal"]), design, {}, data["solver"])
+    def load(cls, folder: Path | str) -> HandedController:
+        """Inverse of `save`."""
+
+        def made(data: Mapping[str, Any], arrays: Mapping[str, Array]) -> HandedController:
+            then = load_controller(Path(folder) / "terminal")
+            plans = MpcController(Goal.from_data(data["goal"]), Design.of(arrays), {}, data["solver"])
             if not isinstance(then, GridController):
                 raise UsageError(f"{folder}: what takes over is no controller on cells; synthesize it again")
-            made = cls(plans, then, data["evidence"], data["terminal"])
-        if made.digest() != data.get("digest"):
-            raise UsageError(f"{folder}: the files of the controller do not belong together; synthesize it again")
-        return made
+            return cls(plans, then, data["evidence"], data["terminal"])
+
+        return loaded(folder, made, "the files of the controller")
 
 
-def handed(
-    problem: SynthesisProblem,
-    terminal: Ending,
-    frame: Frame,
-    whole: Array,
-    rows: Rows,
-    horizon: int,
-    majorant: str,
-    weights: Callable[[Stages, Domain], Weights],
-    wanted: tuple[Array, Array],
-    tolerance: float,
-    solver: Choice,
-    starts: int,
-) -> Controller:
-    """`whole` (r, n + m): the rows of the frame and its relations, scaled to half-widths of 1; wanted: `Mpc._wanted`."""
-    goal, domain, nx, basis = problem.goal, problem.domain, frame.nx, problem.basis
-    names, nominal = domain.states.names + domain.inputs.names, Nominal(problem.model, problem.gap)
-
-    def nothing(reason: str) -> MpcController:
-        return MpcController(goal, None, basis | {"reason": reason, "domain_fraction": 0.0})
-
+def handed(task: Task) -> Controller:
+    """Plans with the controller that takes over from them."""
+    assert task.options.terminal is not None, "who asks says where plans end"
+    terminal = Ending(task.options.terminal)
+    problem, options, frame, names = task.problem, task.options, task.frame, task.names
+    nx, horizon, tolerance = frame.nx, options.horizon, options.tolerance
     then = terminal.controller(problem)
     if not then.wins:
-        return nothing(f"the winning set in which plans would end is empty: {then.evidence['reason']}")
-    zone = Domain(goal.stay, domain.inputs, domain.relations)
-    stages, F = featured(nominal, zone, horizon, frame, majorant != "affine")
-    if (unbounded := np.flatnonzero(~np.isfinite(stages.c[0]))).size:
-        name = names[int(unbounded[0])]
-        return nothing(f"what is left of {name} after the nominal model is unbounded over the goal; narrow the goal")
-    if (free := unreached(stages.A[-1], stages.B[-1])) is not None:
-        mode = names[int(np.argmax(free[1]))]
-        return nothing(f"no gain stabilises {mode}: it grows by {free[0]:.4g} per step, and no input reaches it")
-    cost = weights(stages, domain)
-    made, half = _planning(stages, F, whole, rows, frame, cost, steady(nominal, frame, *wanted)[0], tolerance)
-    if majorant == "auto" and not (half < SMALL).all():
-        stages, F = featured(nominal, zone, horizon, frame, False)
-        made, half = _planning(stages, F, whole, rows, frame, cost, made.reference, tolerance)
-    reference = made.reference
+        return task.nothing(f"the winning set in which plans would end is empty: {then.evidence['reason']}")
+    stages, F = featured(task.nominal, task.zone, horizon, frame, options.majorant != "affine")
+    if (reason := task.unbounded(stages) or task.unstable(stages)) is not None:
+        return task.nothing(reason)
+    weights, reference = task.weights(stages), steady(task.nominal, frame, *task.wanted())[0]
+    made, half = _planning(task, stages, F, weights, reference)
+    if options.majorant == "auto" and not (half < SMALL).all():
+        made, half = _planning(task, *featured(task.nominal, task.zone, horizon, frame, False), weights, reference)
+    assert made.ends is not None
     boxes = ends(then, frame, 2 * (half[:nx] + tolerance), reference[:nx], terminal.boxes)
     if not len(boxes):
         needed = ", ".join(f"± {h * f:.4g} of {n}" for n, h, f in zip(names, half[:nx], frame.half, strict=False))
-        return nothing(f"after {horizon} steps the tube needs {needed}, and no box of winning cells has it; plan fewer steps")
-    design = replace(made, ends=Ends(boxes, F))
-    plans = MpcController(goal, design, {}, "piqp" if solver == "auto" else solver)
-    low, high = np.asarray(goal.stay.low), np.asarray(goal.stay.high)
-    x = low + (high - low) * np.random.default_rng(problem.seed).random((starts, nx))
+        reason = f"after {horizon} steps the tube needs {needed}, and no box of winning cells has it; plan fewer steps"
+        return task.nothing(reason)
+    design = replace(made, ends=replace(made.ends, boxes=boxes))
+    plans = MpcController(problem.goal, design, {}, "piqp" if options.solver == "auto" else options.solver)
+    x = task.drawn(np.random.default_rng(problem.seed), options.starts)
     found = HandedController(plans, then, {}, terminal.policy)
     evidence = {
         "horizon": horizon,
-        "tube": dict(zip(names, (half * frame.half).tolist(), strict=True)),
-        "reference": dict(zip(names, frame.out(reference).tolist(), strict=True)),
+        "tube": task.named(half * frame.half),
+        "reference": task.named(frame.out(reference)),
         "terminal": {"boxes": len(boxes), "share": float(then.contains(x).mean())},
         "domain_fraction": float(found.contains(x).mean()),
     }
     if "assumptions" in then.evidence:
         evidence["assumptions"] = then.evidence["assumptions"]
-    return replace(found, evidence=basis | evidence)
+    return replace(found, evidence=problem.basis | evidence)
 
 
-def _planning(
-    stages: Stages,
-    F: Array,
-    whole: Array,
-    rows: Rows,
-    frame: Frame,
-    weights: Weights,
-    reference: Array,
-    tolerance: float,
-) -> tuple[Design, Array]:
+def _planning(task: Task, stages: Stages, F: Array, weights: Weights, reference: Array) -> tuple[Design, Array]:
     """A design that lacks its boxes yet, and the half-widths (n + m,) of its last section, at the middle of the frame.
 
     No tube is narrower where γ does not grow, and few are where it does.
     """
-    N = stages.horizon
-    section = passing(stages.A[0], stages.B[0], stages.c[0], stages.G[0], F, whole, N)
-    made = Design(frame, stages, section, rows, weights, reference, tolerance, ends=Ends(np.zeros((0, 2, frame.nx)), F))
-    return made, np.asarray(section.support @ made.program().tube(np.zeros((N + 1, len(F))))[-1])
+    frame, section = task.frame, passing(stages, F, task.whole)
+    lacking = Ends(np.zeros((0, 2, frame.nx)), F)
+    made = Design(frame, stages, section, task.rows, weights, reference, task.options.tolerance, ends=lacking)
+    return made, np.asarray(section.support @ made.program().tube(np.zeros((stages.horizon + 1, len(F))))[-1])

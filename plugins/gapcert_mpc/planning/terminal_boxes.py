@@ -3,27 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, final
+from dataclasses import replace
+from typing import final
 
 import numpy as np
 
 from gapcert import Array
 from gapcert.plugin import Bools
-from gapcert_mpc.plans import Plan
 from gapcert_mpc.program.program import LOOSE
 
-if TYPE_CHECKING:
-    from gapcert_mpc.controller import Engine
-
-
-@final
-@dataclass(frozen=True)
-class Ends:
-    """boxes (k, 2, n): [low, high] in the frame, the one that is wanted most first; F as in `Program`."""
-
-    boxes: Array
-    F: Array
+from .design import Ends
+from .engine import Engine
+from .plans import Held, Plan
 
 
 @final
@@ -37,17 +28,15 @@ class Landing:
         self.engine, self.boxes, self.horizon = engine, ends.boxes, engine.program.N
         self.low, self.high = engine.program.limits()
 
-    def begin(self, x: Array) -> Plan | None:
-        """A plan of as many steps as there is one."""
+    def solve(self, x: Array, held: Held | None) -> Plan | None:
+        """A plan of as many steps as there is one, to begin with; then up to the horizon, or what is left of `held` goes on."""
+        if held is not None:
+            return self._within(x, self.horizon, held.plan, np.ones(len(self.boxes), dtype=bool))
         for steps, low, high in reversed(list(self._reached(x))):
             near = np.asarray(((self.boxes[:, 0] <= high) & (self.boxes[:, 1] >= low)).all(axis=1))
             if near.any() and (made := self._within(x, steps, None, near)) is not None:
                 return made
         return None
-
-    def follow(self, x: Array, plan: Plan, age: int) -> Plan | None:
-        """A new plan up to the horizon; where there is none, what is left of `plan` goes on."""
-        return self._within(x, self.horizon, plan, np.ones(len(self.boxes), dtype=bool))
 
     def _reached(self, x: Array) -> Iterator[tuple[int, Array, Array]]:
         """(steps, low, high): boxes that hold x̄ of every plan from x, as far as there may be one; they only rule out."""

@@ -10,9 +10,9 @@ from typing import Generic, NamedTuple, TypeVar, final
 import numpy as np
 
 from gapcert import Array
-
-from .program.linearise import Stages
-from .program.program import Program
+from gapcert.plugin import Ints
+from gapcert_mpc.program.linearise import Stages
+from gapcert_mpc.program.program import Program
 
 T = TypeVar("T")
 
@@ -67,6 +67,31 @@ def plan(program: Program, z: Array, y: Array, piece: int = 0) -> Plan:
 
 
 @final
+@dataclass(frozen=True)
+class Pool:
+    """Known plans: x (k, N+1, n), s (k, N+1, p), and the step at which each arrives, (k,)."""
+
+    x: Array
+    s: Array
+    arrival: Array
+
+    @classmethod
+    def of(cls, plans: list[Plan], program: Program) -> Pool:
+        x = np.array([q.x for q in plans]).reshape(-1, program.N + 1, program.n)
+        s = np.array([q.s for q in plans]).reshape(-1, program.N + 1, program.p)
+        return cls(x, s, np.array([q.arrival for q in plans], dtype=np.int64))
+
+    def near(self, x: Array, most: int) -> list[tuple[int, int]]:
+        """(plan, stage) pairs whose stage is nearest to x, one per plan, nearest first, and not yet at its target."""
+        if not len(self.x):
+            return []
+        away = np.abs(self.x - x).max(axis=2)
+        away[np.arange(self.x.shape[1]) >= self.arrival[:, None]] = np.inf
+        stage, nearest = away.argmin(axis=1), away.min(axis=1)
+        return [(int(i), int(stage[i])) for i in np.argsort(nearest, kind="stable")[:most] if np.isfinite(nearest[i])]
+
+
+@final
 class Held(NamedTuple):
     """What a run remembers: its plan, the steps since that was made, and how many of all its steps went on with a plan.
 
@@ -111,3 +136,7 @@ class Memory(Generic[T]):
 
     def __getitem__(self, number: int) -> T | None:
         return self.kept.get(number)
+
+    def of(self, numbers: Ints) -> list[T | None]:
+        """What runs remember, in their order."""
+        return [self.kept.get(number) for number in numbers.tolist()]

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
 
 from gapcert import Array
 from gapcert.plugin import Bools
-from gapcert_mpc.plans import Held, Plan
 from gapcert_mpc.program.linearise import Frame, Nominal, Stages
 from gapcert_mpc.program.tube import Section, tightest
 
-if TYPE_CHECKING:
-    from gapcert_mpc.controller import Design, Engine
-
+from .design import Design
+from .engine import Engine
+from .plans import Held, Plan
 
 FLOORS = (0.06, 0.02, 0.15)  # of the half-ranges: by how much a plan may move beyond its tube, in turns
 SPARE = 1.2  # of the tube: by how much it may grow
@@ -52,7 +51,7 @@ class Ending:
             last = nominal.along(frame, z, np.maximum(z - radius, -1.0), np.minimum(z + radius, 1.0)).only(on)
             room = np.maximum(np.minimum(last.high - z, z - last.low)[0], 1e-3)
             scaled = np.vstack([np.diag(1 / room), rows])
-            section, shares = tightest(last.A[0], last.B[0], last.c[0], last.G[0], scaled, away=0.0)
+            section, shares = tightest(*last.first, scaled, away=0.0)
             fits = bool((shares < 1).all())
             left = float(np.log(room * (1 - shares[: len(room)])).sum()) if fits else -float(shares.max())
             if best is None or (fits, left) > best[0]:

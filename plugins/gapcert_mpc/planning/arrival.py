@@ -3,47 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, final
+from dataclasses import replace
+from typing import final
 
 import numpy as np
 
 from gapcert import Array
-from gapcert_mpc.plans import Plan
 from gapcert_mpc.program.corridors import Scene, read
-from gapcert_mpc.program.program import LOOSE, Program
-from gapcert_mpc.search import Search
+from gapcert_mpc.program.program import LOOSE
 
-if TYPE_CHECKING:
-    from gapcert_mpc.controller import Engine
+from .engine import Engine
+from .plans import Held, Plan, Pool
+from .search import Search
 
 TRIED = 6  # known plans whose corridors a start tries
 NODES = 500  # of the tree of a search: a start from which nothing is found in so many is taken as one without a plan
-
-
-@final
-@dataclass(frozen=True)
-class Pool:
-    """Known plans: x (k, N+1, n), s (k, N+1, p), and the step at which each arrives, (k,)."""
-
-    x: Array
-    s: Array
-    arrival: Array
-
-    @classmethod
-    def of(cls, plans: list[Plan], program: Program) -> Pool:
-        x = np.array([q.x for q in plans]).reshape(-1, program.N + 1, program.n)
-        s = np.array([q.s for q in plans]).reshape(-1, program.N + 1, program.p)
-        return cls(x, s, np.array([q.arrival for q in plans], dtype=np.int64))
-
-    def near(self, x: Array, most: int) -> list[tuple[int, int]]:
-        """(plan, stage) pairs whose stage is nearest to x, one per plan, nearest first, and not yet at its target."""
-        if not len(self.x):
-            return []
-        away = np.abs(self.x - x).max(axis=2)
-        away[np.arange(self.x.shape[1]) >= self.arrival[:, None]] = np.inf
-        stage, nearest = away.argmin(axis=1), away.min(axis=1)
-        return [(int(i), int(stage[i])) for i in np.argsort(nearest, kind="stable")[:most] if np.isfinite(nearest[i])]
 
 
 @final
@@ -54,11 +28,14 @@ class Arrival:
     per step at least.
     """
 
-    def __init__(self, engine: Engine, scene: Scene, pool: Pool, nodes: int = NODES) -> None:
-        self.engine, self.scene, self.pool = engine, scene, pool
-        self.program = engine.program
+    def __init__(self, engine: Engine, scene: Scene, pool: Pool | None = None) -> None:
+        self.engine, self.scene, self.program = engine, scene, engine.program
+        self.pool = pool or Pool.of([], self.program)
         self.low, self.high = self.program.limits()
-        self.search = Search(self.program, scene, nodes)
+        self.search = Search(self.program, scene, NODES)
+
+    def solve(self, x: Array, held: Held | None) -> Plan | None:
+        return self.follow(x, held.plan, held.age) if held else self.begin(x)
 
     def clear(self, x: Array) -> bool:
         """Is x (frame) outside all obstacles?"""
@@ -118,18 +95,16 @@ class Arrival:
         early[0] = False
         return int(early.argmax()) if early.any() else arrival
 
-
-def explored(engine: Engine, starts: Array, searches: int, pulse: Callable[..., None] = lambda *told: None) -> Pool:
-    """Plans from which corridors are known: searched from starts (frame) from which none so far leads, so many at most."""
-    arrival, found, most = engine.arrival, list[Plan](), searches
-    assert isinstance(arrival, Arrival)
-    for x in starts:
-        if not searches:
-            break
-        if arrival.clear(x) and arrival.known(x) is None:
-            searches -= 1
-            pulse(most - searches, {"corridors": len(found)})
-            if (plan := arrival.searched(x)) is not None:
-                found.append(plan)
-                arrival.pool = Pool.of(found, arrival.program)
-    return arrival.pool
+    def explored(self, starts: Array, searches: int, pulse: Callable[..., None]) -> Pool:
+        """Plans from which corridors are known: searched from starts (frame) from which none so far leads, so many at most."""
+        found, left = list[Plan](), searches
+        for x in starts:
+            if not left:
+                break
+            if self.clear(x) and self.known(x) is None:
+                left -= 1
+                pulse(searches - left, {"corridors": len(found)})
+                if (plan := self.searched(x)) is not None:
+                    found.append(plan)
+                    self.pool = Pool.of(found, self.program)
+        return self.pool

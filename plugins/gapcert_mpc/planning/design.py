@@ -3,21 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
-from typing import Any, final
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any, final, get_args, get_type_hints
 
 import numpy as np
 
 from gapcert import Array
+from gapcert_mpc.program.constraints import Preferred
 from gapcert_mpc.program.corridors import Scene
 from gapcert_mpc.program.linearise import Frame, Stages
 from gapcert_mpc.program.program import Program, Rows, Weights
-from gapcert_mpc.program.soft_constraints import Preferred
 from gapcert_mpc.program.tube import Section
 from gapcert_mpc.program.tuning import Tuning
-from gapcert_mpc.tracking import Course
-from gapcert_mpc.variants.arrival import Pool
-from gapcert_mpc.variants.terminal_boxes import Ends
+
+from .plans import Pool
+from .tracking import Course
+
+
+@final
+@dataclass(frozen=True)
+class Ends:
+    """boxes (k, 2, n): [low, high] in the frame, the one that is wanted most first; F as in `Program`."""
+
+    boxes: Array
+    F: Array
 
 
 @final
@@ -54,30 +63,30 @@ class Design:
         out["successive"] = np.array(self.successive)
         if self.rates is not None:
             out["rates"] = self.rates
-        for name in ("frame", "stages", "section", "rows", "weights", "tuning", "scene", "pool", "ends", "course", "soft"):
-            if (part := getattr(self, name)) is None:
-                continue
-            out |= {f"{name}.{f.name}": np.asarray(getattr(part, f.name)) for f in fields(part)}
+        for part in fields(self):
+            if is_dataclass(value := getattr(self, part.name)):
+                out |= {f"{part.name}.{f.name}": np.asarray(getattr(value, f.name)) for f in fields(value)}
         return out
 
     @classmethod
     def of(cls, arrays: Mapping[str, Array]) -> Design:
         """Inverse of `arrays`."""
 
-        def made(name: str, kind: Any) -> Any:
-            return kind(**{f.name: np.asarray(arrays[f"{name}.{f.name}"]) for f in fields(kind)})
+        def read(name: str) -> Any:
+            value = np.asarray(arrays[name])
+            return value if value.ndim else value.item()
 
-        frame = Frame(arrays["frame.middle"], arrays["frame.half"], int(arrays["frame.nx"]))
-        parts = made("stages", Stages), made("section", Section), made("rows", Rows), made("weights", Weights)
-        tuning = Tuning(float(arrays["tuning.rho"]), float(arrays["tuning.alpha"]), np.asarray(arrays["tuning.pieces"]))
-        scalars = float(arrays["tolerance"]), bool(arrays["successive"])
-        found = cls(frame, *parts, np.asarray(arrays["reference"]), *scalars, tuning)
-        if "rates" in arrays:
-            found = replace(found, rates=np.asarray(arrays["rates"]))
-        if "course.first" in arrays:
-            found = replace(found, course=made("course", Course))
-        if "soft.axis" in arrays:
-            found = replace(found, soft=made("soft", Preferred))
-        if "ends.F" in arrays:
-            return replace(found, ends=made("ends", Ends))
-        return replace(found, scene=made("scene", Scene), pool=made("pool", Pool)) if "scene.low" in arrays else found
+        there, found = {name.partition(".")[0] for name in arrays}, dict[str, Any]()
+        for part in fields(cls):
+            if part.default is None and part.name not in there:
+                continue
+            kind = PARTS.get(part.name)
+            parts = {} if kind is None else {f.name: read(f"{part.name}.{f.name}") for f in fields(kind)}
+            found[part.name] = read(part.name) if kind is None else kind(**parts)
+        return cls(**found)
+
+
+PARTS: dict[str, Any] = {
+    name: kind for name, of in get_type_hints(Design).items() for kind in get_args(of) or (of,) if is_dataclass(kind)
+}
+"""Those that are several arrays."""

@@ -12,9 +12,8 @@ import scipy.sparse as sp
 from gapcert import Array
 from gapcert.plugin import Ints
 from gapcert_engines import muted
-
-from .program.corridors import Scene
-from .program.program import LOOSE, Program
+from gapcert_mpc.program.corridors import Scene
+from gapcert_mpc.program.program import LOOSE, Program
 
 AFTER = 4.0  # half-ranges by which a state or input may leave its own after arrival
 ROUNDS = 5  # with a tube that is given
@@ -111,15 +110,9 @@ class Search:
             column = self.d0 + (stages[:, None] - 1) * self.F + own
             pick = sp.csr_matrix((np.ones(column.size), (np.repeat(stages - 1, len(own)), column.ravel())), (N, self.columns))
             self.stack.append((-pick - self._before(stages), np.full(N, -1.0)))
-        u = p.at["u"][:, None] + np.arange(p.m)
-        size = u.size
+        u, unit = (p.at["u"][:, None] + np.arange(p.m)).ravel(), sp.identity(self.columns, format="csr")
         for sign in (1.0, -1.0):
-            i = np.arange(size)
-            M = sp.csr_matrix(
-                (np.r_[np.full(size, sign), np.full(size, -1.0)], (np.r_[i, i], np.r_[u.ravel(), self.e0 + i])),
-                (size, self.columns),
-            )
-            self.stack.append((M, np.zeros(size)))
+            self.stack.append((sign * unit[u] - unit[self.e0 + np.arange(len(u))], np.zeros(len(u))))
 
     def model(self, tube: Array | None = None) -> tuple[Array, sp.csr_matrix, Array, Array, Array, scipy.optimize.Bounds]:
         """c, A, low, high, integrality and bounds of the variables, for the state that the program begins at."""

@@ -1,1 +1,0 @@
-"""Controllers as files."""

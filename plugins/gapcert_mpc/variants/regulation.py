@@ -1,0 +1,133 @@
+"""Controllers whose plans end around a steady pair, under one gain, along one straight line or along lines of their own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from gapcert import Array
+from gapcert_mpc.controller import MpcController, looked
+from gapcert_mpc.invariant import margin
+from gapcert_mpc.planning import tracking
+from gapcert_mpc.planning.design import Design
+from gapcert_mpc.planning.successive import Ending
+from gapcert_mpc.program.constraints import limits, preferred
+from gapcert_mpc.program.linearise import Stages
+from gapcert_mpc.program.program import NotShrinking
+from gapcert_mpc.program.solver import Name
+from gapcert_mpc.program.tube import Section, taken, tightest
+from gapcert_mpc.program.tuning import Tuning, tuned
+from gapcert_mpc.task import REST, Task
+
+SMALL = 0.05  # of each range: a tube that takes less is not worth the variables that follow γ
+
+
+def regulating(task: Task, like: MpcController | None = None) -> MpcController:
+    """For invariance. like: a controller whose gain and solver it has, and what else need not be found again."""
+    problem, options, frame, nominal = task.problem, task.options, task.frame, task.nominal
+    box, whole, rates = task.box, task.whole, limits(options.rates, problem.domain, frame.u[1])
+    task.tell("successors along the model's lines")
+    if options.linearisation == "successive":
+        ending = Ending.about(nominal, frame, *task.wanted(), whole[len(task.names) :], options.horizon)
+        stages, section, shares = ending.stages, ending.section, ending.shares
+    else:
+        constant = options.majorant != "affine" if like is None else not _follows(like)
+        stages = nominal.straight(box.low, box.high, options.horizon, frame, constant, like is None)
+    if (reason := task.unbounded(stages) or task.unstable(stages)) is not None:
+        return task.nothing(reason)
+    if options.linearisation == "once":
+        task.tell("gain and section of the tube")
+        section, shares = _section(stages, whole, like, rates)
+        if like is None and options.majorant == "auto" and not (shares < SMALL).all():
+            stages = nominal.straight(box.low, box.high, options.horizon, frame)
+            section, shares = _section(stages, whole, like, rates)
+    if not (shares < 1).all():
+        return task.nothing(_too_wide(task, section, shares))
+    task.tell("terminal set and steady state", {"largest share that the tube takes": float(np.max(shares))})
+    design = _design(task, stages, section, rates)
+    if isinstance(design, str):
+        return task.nothing(design)
+    evidence = problem.basis | _evidence(task, design)
+    name: Name = "piqp"
+    if like is not None and like.design is not None:
+        name, design = like.solver, replace(design, tuning=replace(like.design.tuning, pieces=Tuning().pieces))
+    elif not design.successive and options.feedback == "fixed":
+        aim = design.reference[: frame.nx]
+        name, tuning, samples = tuned(design.program(), aim, options.solver, problem.seed, task.tell)
+        design = replace(design, tuning=tuning)
+        evidence["solver"] = {"first": name, "pieces": len(tuning.pieces), "tuned_on": samples}
+    elif options.solver != "auto":
+        name = options.solver
+    made = MpcController(problem.goal, design, {}, name, nominal=nominal if design.successive else None)
+    x = task.drawn(np.random.default_rng(problem.seed), options.starts)
+    evidence["domain_fraction"] = float(looked(made, x, problem.emit).mean())
+    return replace(made, evidence=evidence)
+
+
+def _follows(made: MpcController) -> bool:
+    """Does its tube follow how γ depends on the plan?"""
+    return made.design is not None and bool(made.design.stages.G.any())
+
+
+def _section(stages: Stages, rows: Array, like: MpcController | None, rates: Array | None) -> tuple[Section, Array]:
+    """With the gain of another controller, where one is given."""
+    if like is None or like.design is None:
+        return tightest(*stages.first, rows, rates=rates)
+    A, B, c, G = stages.first
+    section = Section.of(A, B, like.design.section.K)
+    return section, taken(section, c, G, rows, rates=rates)
+
+
+def _design(task: Task, stages: Stages, section: Section, rates: Array | None) -> Design | str:
+    options, domain, frame = task.options, task.problem.domain, task.frame
+    moments = tracking.moments(options.reference, task.problem.model.period)
+    weights, successive, nowhere = task.weights(stages), options.linearisation == "successive", np.zeros(len(frame.half))
+    soft = preferred(options.soft, domain, frame, weights.T[0, 0] / REST)
+    design = Design(frame, stages, section, task.rows, weights, nowhere, options.tolerance, successive, rates=rates)
+    try:
+        program = design.program()
+    except NotShrinking as error:
+        return f"the tube grows without end: by {error.args[0]:.4g} per step; narrow the goal, or shorten the period"
+    found = [program.target(*task.wanted(step)) for step in moments]
+    if (first := found[0]) is None:
+        reason = "no steady state keeps its tube within the goal; widen the goal, or give the input more authority"
+        return reason if successive else f"{reason}, or use {_HINT}"
+    course = tracking.Course(np.array(moments), np.array(found)) if len(found) > 1 else None
+    return replace(design, reference=first, course=course, soft=soft)
+
+
+def _evidence(task: Task, design: Design) -> dict[str, Any]:
+    program, frame = design.program(), task.frame
+    base, _, per = program.terminal
+    away = np.abs(design.reference - design.stages.centre[-1])
+    size = base + per @ away[program.on]
+    x, u = design.reference[: frame.nx], design.reference[frame.nx :]
+    moves = {} if design.course is None else {"schedule": design.course.shown(frame, task.names, task.problem.model.period)}
+    return moves | {
+        "horizon": task.options.horizon,
+        "terminal_margin": margin(task.nominal, frame, design.section, x, u, size),
+        "tube": task.named(design.section.support @ size * frame.half),
+        "reference": task.named(frame.out(design.reference)),
+    }
+
+
+def _too_wide(task: Task, section: Section, shares: Array) -> str:
+    names, frame, successive = task.names, task.frame, task.options.linearisation == "successive"
+    if not np.isfinite(shares).all():
+        reason = f"no gain keeps the tube from growing without end (the best spectral radius is {section.radius:.4g})"
+        return reason if successive else f"{reason}; {_HINT}"
+    j = int(np.argmax(shares))
+    if successive:
+        named = names[j] if j < len(names) else "a relation"
+        return f"at rest the tube needs {shares[j]:.3g} times the room that there is for {named}; a tighter γ would help"
+    if (i := j - len(task.whole)) >= 0:
+        input_ = names[frame.nx + i]
+        return f"the feedback alone takes {shares[j]:.3g} times the rate of {input_}; a tighter γ or a higher rate would help"
+    room = f"the tube needs ± {shares[j] * frame.half[j]:.4g} of {names[j]}" if j < len(names) else "the tube breaks a relation"
+    goal = f", and the goal leaves ± {frame.half[j]:.4g}" if j < len(names) else ""
+    return f"{room}{goal}; a tighter γ, a shorter period or a wider goal would help, or {_HINT}"
+
+
+_HINT = "`linearisation: successive`, which makes the model straight about each plan alone"
