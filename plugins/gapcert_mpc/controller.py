@@ -41,14 +41,8 @@ class Remembered(Protocol):
     def shifted(self) -> int: ...
 
 
-class Digested(Protocol):
-    """What knows the SHA-256 of everything that determines it."""
-
-    def digest(self) -> str: ...
-
-
 R = TypeVar("R", bound=Remembered)
-C = TypeVar("C", bound=Digested)
+C = TypeVar("C", bound=Any)
 
 
 class PlanController(Controller, Generic[R]):
@@ -117,8 +111,8 @@ class PlanController(Controller, Generic[R]):
 
     def advance(self, x: Array, memory: Ints) -> Ints:
         out = np.zeros(len(x), dtype=np.int64)
-        for i, (row, number) in enumerate(zip(self.framed(x), memory.tolist(), strict=True)):
-            if (held := self.memory[number]) is not None and (then := self._next(row, held)) is not None:
+        for i, (row, held) in enumerate(zip(self.framed(x), self.memory.of(memory), strict=True)):
+            if held is not None and (then := self._next(row, held)) is not None:
                 out[i] = self.memory.add(then)
                 self.counts["shifted" if then.age else "solved"] += 1
         return out
@@ -126,14 +120,14 @@ class PlanController(Controller, Generic[R]):
     def keeps(self, x: Array, memory: Ints) -> Bools:
         if self.design is None:
             return np.zeros(len(x), dtype=bool)
-        held = [self.memory[number] for number in memory.tolist()]
-        return np.array([h is not None and self._held(row, h) for row, h in zip(self.framed(x), held, strict=True)], np.bool_)
+        at = zip(self.framed(x), self.memory.of(memory), strict=True)
+        return np.array([held is not None and self._held(row, held) for row, held in at], np.bool_)
 
     def respond(self, x: Array, memory: Ints, policy: Policy, seed: int = 0, k: int = 0) -> Array:
         middle, half = self.design.frame.u if self.design is not None else np.empty((2, 0))
         out = np.empty((len(x), len(half)))
-        for i, number in enumerate(memory.tolist()):
-            if (held := self.memory[number]) is None:
+        for i, held in enumerate(self.memory.of(memory)):
+            if held is None:
                 raise UsageError(
                     f"controller: row {i}: no plan begins at {np.asarray(x)[i].tolist()}; ask `contains` before `act`"
                 )
@@ -146,15 +140,13 @@ class PlanController(Controller, Generic[R]):
     def kept(self, x: Array, u: Array, after: Array, memory: Ints | None = None) -> Bools:
         """(n,): did the step end in the tube of the plan that was being kept, after an input that was not far from the last?"""
         numbers = self.start(x) if memory is None else memory
-        held = [self.memory[number] for number in numbers.tolist()]
-        steps = zip(u, self.framed(after), held, strict=True)
+        steps = zip(u, self.framed(after), self.memory.of(numbers), strict=True)
         out = np.array([h is not None and self._stepped(v, row, h) for v, row, h in steps], np.bool_)
         return np.asarray(out | self.over(after, numbers))
 
     def fallbacks(self, memory: Ints) -> Ints:
         """(n,): steps of each run that went on with a plan of before, with the one that is about to be made."""
-        held = [self.memory[n] for n in memory.tolist()]
-        return np.array([0 if h is None else h.shifted for h in held], dtype=np.int64)
+        return np.array([0 if held is None else held.shifted for held in self.memory.of(memory)], dtype=np.int64)
 
     def predicted(self, x: Array, memory: Ints | None = None) -> tuple[Array, Array, Array] | None:
         """Centres and boxes of the steps to come, as far as they are planned, angles by the turn that x is at."""
@@ -229,13 +221,13 @@ class MpcController(PlanController[Held]):
         """
         if self.design is None or self.design.successive or self.design.scene or self.design.ends:
             raise UsageError("aim: only invariance, along one straight line, takes another reference; make another controller")
-        held = [self.memory[number] for number in memory.tolist()]
         z = another(self.engine.program, self.design.frame, reference, self.goal.stay.axes)
+        held = self.memory.of(memory)
         return np.array([0 if h is None else self.memory.add(h._replace(aim=z)) for h in held], dtype=np.int64)
 
     def respond(self, x: Array, memory: Ints, policy: Policy, seed: int = 0, k: int = 0) -> Array:
-        for i, number in enumerate(memory.tolist()):
-            if (held := self.memory[number]) is not None and held.age == held.plan.arrival:
+        for i, held in enumerate(self.memory.of(memory)):
+            if held is not None and held.age == held.plan.arrival:
                 raise UsageError(f"controller: row {i}: the goal is reached; ask `goal.reached` before `act`")
         return super().respond(x, memory, policy, seed, k)
 
@@ -246,10 +238,9 @@ class MpcController(PlanController[Held]):
         return self._within(x, held.plan, held.age)
 
     def _stepped(self, u: Array, after: Array, held: Held) -> bool:
-        middle, half = self._design.frame.u
-        # An input of before is held only where rates are limited.
-        slow = held.before is None or (np.abs((u - middle) / half - held.before) <= self._design.rates + 1e-9).all()
-        return self._within(after, held.plan, held.age + 1) and bool(slow)
+        (middle, half), rates = self._design.frame.u, self._design.rates
+        slow = rates is None or held.before is None or (np.abs((u - middle) / half - held.before) <= rates + 1e-9).all()
+        return bool(slow) and self._within(after, held.plan, held.age + 1)
 
     def _within(self, x: Array, plan: Plan, age: int) -> bool:
         if plan.arrival is not None and age > plan.arrival:

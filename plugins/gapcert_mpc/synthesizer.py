@@ -12,8 +12,7 @@ from gapcert_cells import loading
 
 from .controller import MpcController
 from .planning import tracking
-from .program.rates import limits
-from .program.soft_constraints import preferred
+from .program.constraints import limits, preferred
 from .task import MpcOptions, Task, frame_of
 from .variants.adaptive import AdaptiveMpcController, adaptive
 from .variants.parameters import named, ranged

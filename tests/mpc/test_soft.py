@@ -14,7 +14,7 @@ from tube_designs import drawn
 from gapcert import UsageError
 from gapcert_cells.testing import Band, Rod, rod_problem, rod_reach_avoid
 from gapcert_mpc.controller import MpcController
-from gapcert_mpc.program.soft_constraints import Preferred
+from gapcert_mpc.program.constraints import Preferred
 from gapcert_mpc.program.solver import Piqp
 from gapcert_mpc.synthesizer import Mpc
 

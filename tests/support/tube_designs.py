@@ -28,10 +28,10 @@ def designed(A: Array, B: Array, c: Array, G: Array, N: int, wanted: Array, rows
     X = riccati(A, B, np.ones(n), np.ones(m))
     scale = 1 / X.max()
     weights = Weights(np.eye(n) * scale, np.eye(m) * scale, X * scale, np.eye(n) * 1e-3 * scale)
-    aim = Program(stages, section, rows, weights, 1e-5).target(wanted[:n], wanted[n:], one)
+    aim = Program(stages, section, rows, weights, 1e-5).target(wanted, one)
     if aim is None:
         raise ValueError("no steady state keeps its tube")
-    return Design(Frame(nothing, one, n), stages, section, rows, weights, np.concatenate(aim), 1e-5)
+    return Design(Frame(nothing, one, n), stages, section, rows, weights, aim, 1e-5)
 
 
 def with_pieces(design: Design) -> Design:

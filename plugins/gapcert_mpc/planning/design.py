@@ -9,10 +9,10 @@ from typing import Any, final, get_args, get_type_hints
 import numpy as np
 
 from gapcert import Array
+from gapcert_mpc.program.constraints import Preferred
 from gapcert_mpc.program.corridors import Scene
 from gapcert_mpc.program.linearise import Frame, Stages
 from gapcert_mpc.program.program import Program, Rows, Weights
-from gapcert_mpc.program.soft_constraints import Preferred
 from gapcert_mpc.program.tube import Section
 from gapcert_mpc.program.tuning import Tuning
 

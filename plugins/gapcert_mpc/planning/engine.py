@@ -32,9 +32,10 @@ class Engine:
         first = 0 if guess is None else guess.piece
         if self.pieces is not None and (known := self.pieces(x, first)) is not None:
             return plan(self.program, *known)
-        z, y, *begun = self.later
-        start = begun if guess is None else (guess.z[z], guess.y[y])
-        return self.found(x, *start, first, before=before)
+        later_z, later_y, z, y = self.later
+        if guess is not None:
+            z, y = guess.z[later_z], guess.y[later_y]
+        return self.found(x, z, y, first, before=before)
 
     def found(
         self, x: Array, z: Array, y: Array, first: int = 0, A: Array | None = None, before: Array | None = None

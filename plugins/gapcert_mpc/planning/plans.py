@@ -10,6 +10,7 @@ from typing import Generic, NamedTuple, TypeVar, final
 import numpy as np
 
 from gapcert import Array
+from gapcert.plugin import Ints
 from gapcert_mpc.program.linearise import Stages
 from gapcert_mpc.program.program import Program
 
@@ -135,3 +136,7 @@ class Memory(Generic[T]):
 
     def __getitem__(self, number: int) -> T | None:
         return self.kept.get(number)
+
+    def of(self, numbers: Ints) -> list[T | None]:
+        """What runs remember, in their order."""
+        return [self.kept.get(number) for number in numbers.tolist()]

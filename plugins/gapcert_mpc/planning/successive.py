@@ -51,7 +51,7 @@ class Ending:
             last = nominal.along(frame, z, np.maximum(z - radius, -1.0), np.minimum(z + radius, 1.0)).only(on)
             room = np.maximum(np.minimum(last.high - z, z - last.low)[0], 1e-3)
             scaled = np.vstack([np.diag(1 / room), rows])
-            section, shares = tightest(last.A[0], last.B[0], last.c[0], last.G[0], scaled, away=0.0)
+            section, shares = tightest(*last.first, scaled, away=0.0)
             fits = bool((shares < 1).all())
             left = float(np.log(room * (1 - shares[: len(room)])).sum()) if fits else -float(shares.max())
             if best is None or (fits, left) > best[0]:

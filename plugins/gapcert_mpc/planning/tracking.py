@@ -84,19 +84,13 @@ def wanted(reference: Mapping[str, Quantity], axes: Sequence[StateSpec], frame: 
     return z, matter
 
 
-def steady(program: Program, z: Array, matter: Array) -> Array | None:
-    """(n+m,): the steady pair that can be kept and is nearest to what is wanted; None where none can."""
-    found = program.target(z[: program.n], z[program.n :], matter)
-    return None if found is None else np.concatenate(found)
-
-
 def another(program: Program, frame: Frame, reference: Mapping[str, Quantity], states: Sequence[StateSpec]) -> Array:
     """(n+m,): the steady pair for states that are wanted; UsageError where one is unknown, or no quantity."""
     names = [axis.name for axis in states]
     if unknown := [name for name in reference if name not in names]:
         raise UsageError(f"aim: '{unknown[0]}' is no state; expected some of {', '.join(names)}")
     try:
-        found = steady(program, *wanted(reference, states, frame))
+        found = program.target(*wanted(reference, states, frame))
     except ValueError as error:
         raise UsageError(f"aim: {error}") from None
     assert found is not None, "a controller that wins has a steady pair"

@@ -75,13 +75,14 @@ def grown(closed: Array, rows: Array, c: Array, G: Array, whole: Array, steps: i
     return np.asarray(total[: len(rows)])
 
 
-def passing(A: Array, B: Array, c: Array, G: Array, F: Array, rows: Array, steps: int) -> Section:
-    """The section whose tube leaves most of the rows (r, n + m), each scaled to 1, after so many steps; it need not shrink.
+def passing(stages: Stages, F: Array, rows: Array) -> Section:
+    """The section whose tube leaves most of the rows (r, n + m), each scaled to 1, at the horizon; it need not shrink.
 
     Linear-quadratic regulators are tried as `tube.tightest` does, by what a tube needs at least and then by what their sections
     need, with a weight on each of F (f, n + m) as well: a feedback that leaves what the uncertainty depends on alone may be
     worth more than one that contracts.
     """
+    (A, B, c, G), steps = stages.first, stages.horizon
     n, m = B.shape
 
     def gain(logs: Array) -> Array:

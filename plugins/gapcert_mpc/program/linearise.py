@@ -69,6 +69,11 @@ class Stages:
     def horizon(self) -> int:
         return len(self.A) - 1
 
+    @property
+    def first(self) -> tuple[Array, Array, Array, Array]:
+        """(A, B, c, G) of the first of them, which a tube is made for."""
+        return self.A[0], self.B[0], self.c[0], self.G[0]
+
     def repeated(self, count: int) -> Stages:
         """The first of them `count` times."""
         return self.taken(np.zeros(count, dtype=np.int64))

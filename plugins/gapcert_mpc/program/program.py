@@ -13,8 +13,8 @@ import scipy.sparse as sp
 from gapcert import Array
 from gapcert.plugin import Ints
 
+from .constraints import Preferred
 from .linearise import Stages
-from .soft_constraints import Preferred
 from .solver import Piqp
 from .tube import Section
 
@@ -368,8 +368,8 @@ class Program:
             np.hstack([st.high, np.broadcast_to(np.minimum(self.rows.high, LOOSE), shape)]),
         )
 
-    def target(self, x: Array, u: Array, weights: Array) -> tuple[Array, Array] | None:
-        """The steady pair whose terminal set keeps all rows, nearest to (x, u) in |weights · ·|; None where there is none."""
+    def target(self, z: Array, weights: Array) -> Array | None:
+        """The steady pair (n + m,) whose terminal set keeps all rows, nearest to z in |weights · ·|, if there is one."""
         at, n, m = self.at, self.n, self.m
         columns = np.concatenate([np.arange(at[k][-1], at[k][-1] + w) for k, w in (("xs", n), ("us", m), ("size", self.p))])
         kept = self.final
@@ -380,9 +380,9 @@ class Program:
             kept = np.concatenate([kept, self.sizes[self.N] + np.arange(q), last])
         A = self.A[kept][:, columns]
         goal, weight = np.zeros(len(columns)), np.full(len(columns), 1e-9)
-        goal[: n + m], weight[: n + m] = np.concatenate([x, u]), np.maximum(weights, 1e-6)
+        goal[: n + m], weight[: n + m] = z, np.maximum(weights, 1e-6)
         found = Piqp(sp.diags(weight, format="csc"), -weight * goal, A, self.low[kept], self.high[kept], 1e-8).solve()
-        return (found.z[:n], found.z[n : n + m]) if found.status == "solved" else None
+        return found.z[: n + m] if found.status == "solved" else None
 
     # -- cost -------------------------------------------------------------------------------------------------------------
 

@@ -63,21 +63,10 @@ class Levels:
         return self.made[key]
 
     def told(self) -> dict[str, Any]:
-        """What `again` needs besides the problem, JSON-able."""
+        """What they are made by besides the problem, JSON-able."""
         ends = zip(self.family.range.lo.tolist(), self.family.range.hi.tolist(), strict=True)
         ranges = dict(zip(self.family.names, map(list, ends), strict=True))
         return {"range": ranges, "levels": self.depth, "options": dict(self.options)}
-
-    @classmethod
-    def again(cls, known: Mapping[str, Any], goal: Goal, told: Mapping[str, Any], make: Maker) -> Levels:
-        """None of them is made yet."""
-        problem = SynthesisProblem(known["model"], known["gap"], known["domain"], goal, known["seed"])
-        return cls(Family.of(problem, told["range"]), told["options"], told["levels"], make)
-
-    def begun(self, first: MpcController) -> AdaptiveMpcController:
-        """With the controller for the whole range, which has been made."""
-        self.made[self.first] = first
-        return AdaptiveMpcController(first.goal, self, first.evidence)
 
     def box(self, key: Key) -> Interval:
         """Θ of a level, (nθ,)."""
@@ -154,7 +143,7 @@ class AdaptiveMpcController(Controller):
 
     def _held(self, memory: Ints) -> dict[int, Held]:
         """Of the rows whose runs are known."""
-        return {i: held for i, n in enumerate(memory.tolist()) if (held := self.runs[n]) is not None}
+        return {i: held for i, held in enumerate(self.runs.of(memory)) if held is not None}
 
     def _learned(self, after: Array, memory: Ints) -> list[Held]:
         """What the step to `after` says of Θ."""
@@ -211,8 +200,7 @@ class AdaptiveMpcController(Controller):
 
     def fallbacks(self, memory: Ints) -> Ints:
         """(n,): steps of each run that went on with a plan of before."""
-        held = [self.runs[n] for n in memory.tolist()]
-        return np.array([0 if h is None else h.shifted for h in held], dtype=np.int64)
+        return np.array([0 if held is None else held.shifted for held in self.runs.of(memory)], dtype=np.int64)
 
     def predicted(self, x: Array, memory: Ints | None = None) -> tuple[Array, Array, Array] | None:
         """As the controller of the run's level has it; it holds for all of the level's box."""
@@ -228,7 +216,7 @@ class AdaptiveMpcController(Controller):
     def learned(self, memory: Ints) -> dict[str, Array]:
         """Θ of each run by name, (n, 2); NaN from where it was refuted. A run that has not begun knows the whole range."""
         whole, out = self.levels.family.range, np.empty((len(memory), len(self.levels.family.names), 2))
-        for i, held in enumerate(self.runs[n] for n in memory.tolist()):
+        for i, held in enumerate(self.runs.of(memory)):
             theta = whole if held is None else held.theta
             out[i] = np.nan if held is not None and held.refuted else np.stack([theta.lo, theta.hi], axis=1)
         return {name: out[:, j] for j, name in enumerate(self.levels.family.names)}
@@ -272,11 +260,14 @@ class AdaptiveMpcController(Controller):
         """Inverse of `save`, where it has what the others follow from; maker: makes of options who makes them."""
 
         def made(data: Mapping[str, Any], arrays: Mapping[str, Array]) -> AdaptiveMpcController:
-            goal, told = Goal.from_data(data["goal"]), data["adapt"]
-            levels = Levels.again(known(data["kept"], arrays), goal, told, maker(told["options"]))
+            of, told = known(data["kept"], arrays), data["adapt"]
+            problem = SynthesisProblem(of["model"], of["gap"], of["domain"], Goal.from_data(data["goal"]), of["seed"])
+            levels = Levels(Family.of(problem, told["range"]), told["options"], told["levels"], maker(told["options"]))
             # The first controller's model is the one in the middle of the range.
             own = levels.family.within(levels.family.range)
-            return levels.begun(MpcController.read(Path(folder), data, arrays, Nominal(own.model, own.gap)))
+            first = MpcController.read(Path(folder), data, arrays, Nominal(own.model, own.gap))
+            levels.made[levels.first] = first
+            return cls(first.goal, levels, first.evidence)
 
         return loaded(folder, made)
 

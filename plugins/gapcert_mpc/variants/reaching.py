@@ -33,7 +33,7 @@ def reaching(task: Task) -> MpcController:
     room = np.minimum((areas.high - areas.low)[:, :nx].max(axis=0, initial=0.0) / 2, 1.0)
     tight = np.flatnonzero((room > 0) & (room < 1))
     whole = np.vstack([task.whole, np.eye(len(frame.half))[tight] / room[tight, None]])
-    section = passing(stages.A[0], stages.B[0], stages.c[0], stages.G[0], F, whole, horizon)
+    section = passing(stages, F, whole)
     rest = np.clip(frame.into(np.zeros(len(frame.half))), -1.0, 1.0)
     design = Design(frame, stages, section, rows, task.weights(stages), rest, options.tolerance, scene=areas)
     rng = np.random.default_rng(problem.seed)

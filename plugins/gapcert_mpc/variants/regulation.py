@@ -13,10 +13,9 @@ from gapcert_mpc.invariant import margin
 from gapcert_mpc.planning import tracking
 from gapcert_mpc.planning.design import Design
 from gapcert_mpc.planning.successive import Ending
+from gapcert_mpc.program.constraints import limits, preferred
 from gapcert_mpc.program.linearise import Stages
 from gapcert_mpc.program.program import NotShrinking
-from gapcert_mpc.program.rates import limits
-from gapcert_mpc.program.soft_constraints import preferred
 from gapcert_mpc.program.solver import Name
 from gapcert_mpc.program.tube import Section, taken, tightest
 from gapcert_mpc.program.tuning import Tuning, tuned
@@ -74,9 +73,9 @@ def _follows(made: MpcController) -> bool:
 
 def _section(stages: Stages, rows: Array, like: MpcController | None, rates: Array | None) -> tuple[Section, Array]:
     """With the gain of another controller, where one is given."""
-    A, B, c, G = stages.A[0], stages.B[0], stages.c[0], stages.G[0]
     if like is None or like.design is None:
-        return tightest(A, B, c, G, rows, rates=rates)
+        return tightest(*stages.first, rows, rates=rates)
+    A, B, c, G = stages.first
     section = Section.of(A, B, like.design.section.K)
     return section, taken(section, c, G, rows, rates=rates)
 
@@ -91,7 +90,7 @@ def _design(task: Task, stages: Stages, section: Section, rates: Array | None) -
         program = design.program()
     except NotShrinking as error:
         return f"the tube grows without end: by {error.args[0]:.4g} per step; narrow the goal, or shorten the period"
-    found = [tracking.steady(program, *task.wanted(step)) for step in moments]
+    found = [program.target(*task.wanted(step)) for step in moments]
     if (first := found[0]) is None:
         reason = "no steady state keeps its tube within the goal; widen the goal, or give the input more authority"
         return reason if successive else f"{reason}, or use {_HINT}"

@@ -12,7 +12,7 @@ from typing import Any, final
 import numpy as np
 
 from gapcert import Array, Context, Controller, Domain, Goal, Model, SynthesisProblem, UsageError, load_controller, registry
-from gapcert.plugin import Bools, Ints, Policy, Synthesizer, of_config
+from gapcert.plugin import Bools, Ints, Policy, Synthesizer
 from gapcert_cells import GridController, write_saved
 from gapcert_mpc.config import Terminal
 from gapcert_mpc.controller import MpcController, loaded
@@ -162,15 +162,14 @@ class HandedController(Controller):
 
     def _left(self, memory: Ints) -> Ints:
         """(n,): steps of its plan that a run has yet to make; at 0 it is in the hands of `then`. −1: there is no plan."""
-        held = [self.plans.memory[n] for n in memory.tolist()]
+        held = self.plans.memory.of(memory)
         return np.array([-1 if h is None else max((h.plan.arrival or 0) - h.age, 0) for h in held], dtype=np.int64)
 
     def start(self, x: Array) -> Ints:
         x = np.atleast_2d(np.asarray(x, dtype=np.float64))
         numbers, won = self.plans.start(x), self.then.contains(x)
-        for i in np.flatnonzero(numbers == 0).tolist():
-            if won[i]:
-                numbers[i] = self.plans.memory.add(Held(self._none))
+        for i in np.flatnonzero((numbers == 0) & won).tolist():
+            numbers[i] = self.plans.memory.add(Held(self._none))
         return numbers
 
     def contains(self, x: Array) -> Bools:
@@ -232,10 +231,9 @@ class HandedController(Controller):
     def save(self, folder: Path | str) -> None:
         """As a controller of plans, and `then` in the folder `terminal` there."""
         folder = Path(folder)
-        data = {"format": 1, "kind": self.kind, "goal": self.goal.to_data(), "evidence": dict(self.evidence)}
-        data |= {"solver": self.plans.solver, "terminal": self.policy, "digest": self.digest()}
+        told = {"terminal": self.policy, "digest": self.digest()}
         self.then.save(folder / "terminal")
-        write_saved(folder, data, self.design.arrays())
+        write_saved(folder, replace(self.plans, evidence=self.evidence).saved() | told, self.design.arrays())
 
     @classmethod
     def load(cls, folder: Path | str) -> HandedController:
@@ -294,8 +292,7 @@ def _planning(task: Task, stages: Stages, F: Array, weights: Weights, reference:
 
     No tube is narrower where γ does not grow, and few are where it does.
     """
-    N, frame = stages.horizon, task.frame
-    section = passing(stages.A[0], stages.B[0], stages.c[0], stages.G[0], F, task.whole, N)
+    frame, section = task.frame, passing(stages, F, task.whole)
     lacking = Ends(np.zeros((0, 2, frame.nx)), F)
     made = Design(frame, stages, section, task.rows, weights, reference, task.options.tolerance, ends=lacking)
-    return made, np.asarray(section.support @ made.program().tube(np.zeros((N + 1, len(F))))[-1])
+    return made, np.asarray(section.support @ made.program().tube(np.zeros((stages.horizon + 1, len(F))))[-1])
