@@ -12,7 +12,7 @@ from typing import Any, final
 import numpy as np
 
 from gapcert import Array, Context, Controller, Domain, Goal, Model, SynthesisProblem, UsageError, load_controller, registry
-from gapcert.plugin import Bools, Ints, Policy, Synthesizer
+from gapcert.plugin import Bools, Ints, Policy, Synthesizer, of_config
 from gapcert_cells import GridController, write_saved
 from gapcert_mpc.config import Terminal
 from gapcert_mpc.controller import MpcController, loaded
