@@ -36,7 +36,7 @@ from tube_designs import mecanum, with_pieces
 from tube_program import twin
 
 import gapcert as gc
-from gapcert.testing.synthesis import Band, Rod, rod_problem
+from gapcert_cells.testing import Band, Rod, rod_problem
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.planning.design import Design
 from gapcert_mpc.planning.engine import Engine

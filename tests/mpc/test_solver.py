@@ -13,7 +13,7 @@ import scipy.sparse as sp
 from tube_designs import drawn, mecanum, with_pieces
 
 from gapcert import UsageError, closed_loop
-from gapcert.testing.synthesis import Band, Rod, rod_problem
+from gapcert_cells.testing import Band, Rod, rod_problem
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.planning.engine import Engine
 from gapcert_mpc.program.pieces import Pieces
