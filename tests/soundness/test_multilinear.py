@@ -10,6 +10,7 @@ from rough_fields import Bump, Coarse
 
 import gapcert as gc
 from gapcert.certification.bounds.curvature import second
+from gapcert_bounds import MultilinearPredictor
 from gapcert_bounds.families.multilinear import Multilinear, MultilinearGap
 from gapcert_bounds.testing.fields import Field, Kink, Waves, gap_problem, lattice
 
@@ -139,7 +140,7 @@ def test_a_multilinear_predictor_is_what_it_says(counts):
     samples = gap_problem(field, (4, 5, 3)).samples
     rng = np.random.default_rng(2)
     axes = tuple(np.sort(rng.uniform(-1, 1, n)) for n in counts)
-    p = gc.plugin.MultilinearPredictor(axes, rng.normal(size=(*counts, 2)))
+    p = MultilinearPredictor(axes, rng.normal(size=(*counts, 2)))
     z = field.domain.draw(500, rng)
     # Slow twin: one axis after the other by numpy's own interpolation.
     for k in range(0, 500, 50):
@@ -164,7 +165,7 @@ def test_a_multilinear_predictor_is_what_it_says(counts):
     assert one.any()
     assert np.allclose(corner.max(axis=0), over.hi[one], atol=1e-12)
     assert np.allclose(corner.min(axis=0), over.lo[one], atol=1e-12)
-    fitted = gc.plugin.MultilinearPredictor.fit(samples, field.domain)
+    fitted = MultilinearPredictor.fit(samples, field.domain)
     assert [len(a) for a in fitted.axes] == [3, 3, 3]
     assert (
         np.abs(samples.r - fitted(samples.z)).mean()

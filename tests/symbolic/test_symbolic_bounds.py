@@ -12,6 +12,7 @@ import gapcert as gc
 from gapcert import Interval
 from gapcert_bounds.testing.fields import Nothing, Waves, gap_problem
 from gapcert_equations.config import EquationsConfig
+from gapcert_functions import mean_value
 from gapcert_symbolic.cells.abstraction import windows
 from gapcert_symbolic.cells.bounds import Bound, Enclosed
 from gapcert_symbolic.cells.gaps import disturbance
@@ -74,10 +75,10 @@ def test_a_wrong_sign_is_caught() -> None:
     model, (low, high, u) = mixing(), cells(200, 0.4)
     reached, z = hull(model, low, high, u), Interval(np.hstack([low, u]), np.hstack([high, u]))
     slope = model.jacobian_enclosure(z)[:, :, :2]
-    assert gc.plugin.mean_value(z, slope, model.enclosure).contains(reached).all()
-    assert not gc.plugin.mean_value(z, Interval.exact(slope.mid), model.enclosure).contains(reached).all()
+    assert mean_value(z, slope, model.enclosure).contains(reached).all()
+    assert not mean_value(z, Interval.exact(slope.mid), model.enclosure).contains(reached).all()
     with pytest.raises(ValueError, match="lower end above upper end"):
-        gc.plugin.mean_value(z, -slope, model.enclosure)
+        mean_value(z, -slope, model.enclosure)
 
 
 def test_a_predictor_shifts_boxes_once() -> None:
