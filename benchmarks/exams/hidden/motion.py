@@ -8,6 +8,7 @@ exceeds the bound. It shares no formula and no code with the fits.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -17,6 +18,40 @@ from exams.hidden.terms import applied, bias, mass, solve
 from gapcert.numerics.arrays import Array, Ints
 
 NEAR = 1e-6  # steps
+
+
+@final
+class Machine(NamedTuple):
+    """A plant by its number with its parameters, and its faults: per coordinate C, per input A, per output S (`slots`)."""
+
+    plant: int
+    p: Array
+    exact: Array
+    C: Array
+    A: Array
+    S: Array
+
+
+@final
+class Drive(NamedTuple):
+    """What a machine is asked at the ticks (T,), in steps of h seconds, and what disturbs it (T, n).
+
+    u (T, nu) is overwritten with what was commanded: clip(u + gains·(reference − y), ±limit). At tick resets[k] the state
+    becomes starts[k] while all memories go on. scheme 0: trapezoid, 1: semi-implicit Euler; hold 1: commands run in straight
+    lines from tick to tick, and must not depend on y.
+    """
+
+    ticks: Ints
+    h: float
+    u: Array
+    gains: Array
+    reference: Array
+    limit: Array
+    resets: Ints
+    starts: Array
+    disturbance: Array
+    scheme: int
+    hold: int
 
 
 @compiled
@@ -96,25 +131,13 @@ def dry(C: Array, j: int) -> bool:
 
 @compiled
 def rates(
-    plant: int,
-    p: Array,
-    exact: Array,
-    C: Array,
-    W: Array,
-    M: Array,
-    at: int,
-    into: int,
-    acting: Array,
-    disturbance: Array,
-    k: int,
-    t: float,
-    release: bool,
+    machine: Machine, disturbance: Array, W: Array, M: Array, at: int, into: int, acting: Array, t: float, release: bool
 ) -> None:
     """Accelerations at the state in row `at` into row `into`; with `release`, stuck joints that cannot be held let go first."""
-    n = W.shape[1]
-    mass(plant, p, exact, C, W, at, M)
-    bias(plant, p, exact, C, W, at)
-    applied(plant, p, W, at, acting)
+    C, n = machine.C, W.shape[1]
+    mass(machine.plant, machine.p, machine.exact, C, W, at, M)
+    bias(machine.plant, machine.p, machine.exact, C, W, at)
+    applied(machine.plant, machine.p, W, at, acting)
     for j in range(n):
         if C[j, s.PLAY] > 0:
             W[s.PLAYED, j] = min(max(W[s.PLAYED, j], W[s.FORCE, j] - C[j, s.PLAY]), W[s.FORCE, j] + C[j, s.PLAY])
@@ -124,7 +147,7 @@ def rates(
         W[s.LOADED, j] = W[s.FORCE, j]
     for j in range(n):
         f = law(C, j, W[at, j], W[at + 1, j], W[s.BRISTLE, j], W[s.LUGRE_BRISTLE, j], t)
-        W[s.FORCE, j] += f + disturbance[k, j] - W[s.BIASED, j]
+        W[s.FORCE, j] += f + disturbance[j] - W[s.BIASED, j]
         if C[j, s.COUPLING] != 0:
             W[s.FORCE, j] -= C[j, s.COUPLING] * W[at + 1, int(C[j, s.PARTNER])]
     for _ in range(n + 1):
@@ -167,28 +190,15 @@ def settle(C: Array, W: Array) -> None:
 
 
 @compiled
-def advance(
-    plant: int,
-    p: Array,
-    exact: Array,
-    C: Array,
-    W: Array,
-    M: Array,
-    acting: Array,
-    disturbance: Array,
-    k: int,
-    t: float,
-    h: float,
-    scheme: int,
-) -> None:
+def advance(machine: Machine, drive: Drive, W: Array, M: Array, acting: Array, k: int, t: float) -> None:
     """One fine step of the state in row NOW."""
-    n = W.shape[1]
-    rates(plant, p, exact, C, W, M, s.NOW, s.PULL, acting, disturbance, k, t, True)
+    C, h, scheme, n = machine.C, drive.h, drive.scheme, W.shape[1]
+    rates(machine, drive.disturbance[k], W, M, s.NOW, s.PULL, acting, t, True)
     for j in range(n):
         W[s.NEXT_SPEED, j] = W[s.SPEED, j] + h * W[s.PULL, j]
         W[s.NEXT, j] = W[s.NOW, j] + h * W[s.SPEED if scheme == 0 else s.NEXT_SPEED, j]
     if scheme == 0:
-        rates(plant, p, exact, C, W, M, s.NEXT, s.NEXT_PULL, acting, disturbance, k, t + h, False)
+        rates(machine, drive.disturbance[k], W, M, s.NEXT, s.NEXT_PULL, acting, t + h, False)
         for j in range(n):
             W[s.NEXT, j] = W[s.NOW, j] + 0.5 * h * (W[s.SPEED, j] + W[s.NEXT_SPEED, j])
             W[s.NEXT_SPEED, j] = W[s.SPEED, j] + 0.5 * h * (W[s.PULL, j] + W[s.NEXT_PULL, j])
@@ -247,84 +257,20 @@ def remember(W: Array, ring: Array, now: int) -> None:
         ring[now & 4095, j], ring[now & 4095, n + j] = W[s.NOW, j], W[s.SPEED, j]
 
 
-def simulate(
-    plant: int,
-    p: Array,
-    exact: Array,
-    C: Array,
-    A: Array,
-    S: Array,
-    ticks: Ints,
-    h: float,
-    u: Array,
-    gains: Array,
-    reference: Array,
-    limit: Array,
-    resets: Ints,
-    starts: Array,
-    disturbance: Array,
-    scheme: int,
-    hold: int,
-) -> tuple[Array, Array]:
-    """(x, y): true states and sensed states (T, 2n) at the ticks (in steps of h seconds).
-
-    u (T, nu) is overwritten with what was commanded: clip(u + gains·(reference − y), ±limit). At tick resets[k] the state
-    becomes starts[k] while all memories go on. scheme 0: trapezoid, 1: semi-implicit Euler; hold 1: commands run in straight
-    lines from tick to tick, and must not depend on y.
-    """
-    (T, nu), n = u.shape, len(C)
+def simulate(machine: Machine, drive: Drive) -> tuple[Array, Array]:
+    """(x, y): true states and sensed states (T, 2n) at the ticks."""
+    (T, nu), n = drive.u.shape, len(machine.C)
     x, y, ring = np.empty((T, 2 * n)), np.empty((T, 2 * n)), np.zeros((4096, 2 * n))
     W, M = np.zeros((s.WORKSPACE, n)), np.zeros((2, n, n))
     memory, arrived, acting = np.zeros((nu, 3)), np.zeros(nu, dtype=np.int64), np.zeros(nu)
-    march(
-        plant,
-        p,
-        exact,
-        C,
-        A,
-        S,
-        ticks,
-        h,
-        u,
-        gains,
-        reference,
-        limit,
-        resets,
-        starts,
-        disturbance,
-        scheme,
-        hold,
-        x,
-        y,
-        ring,
-        W,
-        M,
-        memory,
-        arrived,
-        acting,
-    )
+    march(machine, drive, x, y, ring, W, M, memory, arrived, acting)
     return x, y
 
 
 @compiled
 def march(
-    plant: int,
-    p: Array,
-    exact: Array,
-    C: Array,
-    A: Array,
-    S: Array,
-    ticks: Ints,
-    h: float,
-    u: Array,
-    gains: Array,
-    reference: Array,
-    limit: Array,
-    resets: Ints,
-    starts: Array,
-    disturbance: Array,
-    scheme: int,
-    hold: int,
+    machine: Machine,
+    drive: Drive,
     x: Array,
     y: Array,
     ring: Array,
@@ -335,32 +281,32 @@ def march(
     acting: Array,
 ) -> None:
     """The loop of `simulate` over preallocated arrays."""
-    T, nu = u.shape
-    n = W.shape[1]
+    A, ticks, h, u = machine.A, drive.ticks, drive.h, drive.u
+    (T, nu), n = u.shape, W.shape[1]
     r, now = 0, ticks[0]
     for k in range(T):
-        if r < len(resets) and resets[r] == k:
+        if r < len(drive.resets) and drive.resets[r] == k:
             for j in range(n):
-                W[s.NOW, j], W[s.SPEED, j] = starts[r, j], starts[r, n + j]
-            settle(C, W)
+                W[s.NOW, j], W[s.SPEED, j] = drive.starts[r, j], drive.starts[r, n + j]
+            settle(machine.C, W)
             r += 1
-            rates(plant, p, exact, C, W, M, s.NOW, s.PULL, acting, disturbance, k, now * h, True)
-            imagine(S, W, ring, now, h)
+            rates(machine, drive.disturbance[k], W, M, s.NOW, s.PULL, acting, now * h, True)
+            imagine(machine.S, W, ring, now, h)
         remember(W, ring, now)
         for j in range(n):
             x[k, j], x[k, n + j] = W[s.NOW, j], W[s.SPEED, j]
-        sensed(S, W, ring, now, k, h, y)
+        sensed(machine.S, W, ring, now, k, h, y)
         for i in range(nu):
             for j in range(2 * n):
-                u[k, i] += gains[i, j] * (reference[k, j] - y[k, j])
-            u[k, i] = min(max(u[k, i], -limit[i]), limit[i])
+                u[k, i] += drive.gains[i, j] * (drive.reference[k, j] - y[k, j])
+            u[k, i] = min(max(u[k, i], -drive.limit[i]), drive.limit[i])
         while k + 1 < T and now < ticks[k + 1]:
             for i in range(nu):
                 since = now - A[i, s.DELAY] / h
                 while arrived[i] < k and ticks[arrived[i] + 1] <= since + NEAR:
                     arrived[i] += 1
-                command = commanded(u, ticks, arrived[i], i, since, hold)
+                command = commanded(u, ticks, arrived[i], i, since, drive.hold)
                 acting[i] = path(A, i, memory, command, h)
-            advance(plant, p, exact, C, W, M, acting, disturbance, k, now * h, h, scheme)
+            advance(machine, drive, W, M, acting, k, now * h)
             now += 1
             remember(W, ring, now)

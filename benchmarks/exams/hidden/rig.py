@@ -9,7 +9,7 @@ import numpy as np
 
 from exams.hidden import slots
 from exams.hidden.laws import Hidden, Scales, Tables
-from exams.hidden.motion import simulate
+from exams.hidden.motion import Drive, Machine, simulate
 from exams.hidden.plants import PLANTS, Plant
 from exams.hidden.terms import mass
 from gapcert.numerics.arrays import Array, Ints
@@ -101,25 +101,11 @@ class Rig:
         gains: Array,
     ) -> Motion:
         tables = Tables.of(self.plant, self.parameters).hide(effects)
-        x, y = simulate(
-            self.plant.number,
-            tables.parameters,
-            np.array([*self.plant.exact, 0.0]),
-            tables.coordinates,
-            tables.inputs,
-            tables.outputs,
-            ticks,
-            step,
-            u,
-            gains,
-            self.reference,
-            self.limit,
-            resets,
-            np.ascontiguousarray(starts),
-            self.disturbance,
-            scheme,
-            int(self.hold == "first"),
-        )
+        exact, starts, hold = np.array([*self.plant.exact, 0.0]), np.ascontiguousarray(starts), int(self.hold == "first")
+        faults = tables.coordinates, tables.inputs, tables.outputs
+        machine = Machine(self.plant.number, tables.parameters, exact, *faults)
+        asked = Drive(ticks, step, u, gains, self.reference, self.limit, resets, starts, self.disturbance, scheme, hold)
+        x, y = simulate(machine, asked)
         return Motion(np.asarray(ticks * step, dtype=np.float64), x, y, u)
 
     def scales(self, motion: Motion, kind: str, site: str) -> Scales:
