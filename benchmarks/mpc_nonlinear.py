@@ -22,8 +22,8 @@ sys.path.append(str(Path(__file__).parents[1] / "tests" / "plugins" / "mpc"))
 from test_nonlinear import CARTPOLE, CARTPOLE_GAP, CARTPOLE_Z, QUADROTOR, QUADROTOR_GAP, QUADROTOR_Z, band, problem
 
 from gapcert import Interval
-from gapcert_mpc.program.linearise import PARTS
 from gapcert_mpc.synthesizer import Mpc
+from gapcert_mpc.thresholds import THRESHOLDS
 
 
 def measured(name: str, spec: Any, ranges: Any, gamma: np.ndarray, steps: int, horizon: int = 20) -> list[Row]:
@@ -44,7 +44,7 @@ def measured(name: str, spec: Any, ranges: Any, gamma: np.ndarray, steps: int, h
             began = time.process_time()
             memory[i : i + 1] = controller.advance(x[i : i + 1], memory[i : i + 1])
             times.append(time.process_time() - began)
-    boxes = Interval(np.full((horizon * PARTS, model.nx + model.nu), -0.1), 0.1)
+    boxes = Interval(np.full((horizon * THRESHOLDS.slope_parts, model.nx + model.nu), -0.1), 0.1)
     began = time.process_time()
     for _ in range(20):
         model.jacobian_enclosure(boxes)

@@ -18,7 +18,8 @@ from exams.hidden.rig import Rig, rig
 from exams.hidden.truth import Truth
 from exams.sit import Record
 from gapcert_diagnosis.data.dataset import Dataset
-from gapcert_diagnosis.experiment.design import SMALLER, Limits
+from gapcert_diagnosis.experiment.design import Limits
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
 FIXED = ("multisine", "steps", "chirp")
 LEAST = 100  # samples that are played of an input that leaves the limits at once
@@ -75,7 +76,7 @@ def _fixed(case: Case, kind: str, limits: Limits) -> Rig:
     columns = [names.index(n) for n in case.noise.sigma]
     least, most = np.array([limits.outputs[n] for n in case.noise.sigma]).T
     best, worth = case.rig.given(u), -1.0
-    for size in SMALLER:
+    for size in THRESHOLDS.input_sizes:
         tried = case.rig.given(size * ((low + high) / 2 + (high - low) / 2 * shape))
         y = tried.play(case.hidden).x[:, columns]
         inside = ((y >= least) & (y <= most)).all(axis=1)

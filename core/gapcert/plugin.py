@@ -80,6 +80,7 @@ _HOME = homes(
         "gapcert.testing.checks": "expect",
         "gapcert.testing.signals": "multisine",
         "gapcert.testing.toys": "PLAIN",
+        "gapcert.thresholds": "chosen decides reasons threshold",
         "gapcert.version": "__version__",
     }
 )

@@ -207,4 +207,8 @@ from gapcert.spec.text.source import read as read
 from gapcert.testing.checks import expect as expect
 from gapcert.testing.signals import multisine as multisine
 from gapcert.testing.toys import PLAIN as PLAIN
+from gapcert.thresholds import chosen as chosen
+from gapcert.thresholds import decides as decides
+from gapcert.thresholds import reasons as reasons
+from gapcert.thresholds import threshold as threshold
 from gapcert.version import __version__ as __version__

@@ -37,7 +37,7 @@ from .progress import LoopProgress
 from .starts import draw_starts as draw_starts
 from .starts import taken_first
 
-SHARES = 4
+SHARES = 4  # shares per worker; chosen, not measured
 StartsFrom = Literal["both", "without_gamma"]
 
 

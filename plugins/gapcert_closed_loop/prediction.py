@@ -13,7 +13,7 @@ from gapcert.plugin import TURN, Array, Policy, System, turned
 if TYPE_CHECKING:
     from gapcert.plugin import Controller
 
-MOMENTS = 4
+MOMENTS = 4  # of a run, whose predictions are drawn; chosen, not measured
 
 
 @final

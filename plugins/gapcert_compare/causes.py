@@ -23,19 +23,13 @@ from gapcert.plugin import (
     registry,
     write_atomic,
 )
+from gapcert_compare.thresholds import THRESHOLDS
 from gapcert_diagnosis import Cause, Diagnosis
 from gapcert_engines import PHYSICAL, EngineBackend, EngineModel, Options, changed, declared, flat, plain, short
 from gapcert_recordings import play
 
 from .laboratory import Laboratory, Peer
 from .settings import Change, candidates
-
-TRAJECTORIES, STEPS, SECONDS = 4, 600, 3.0
-"""Of the recording: as many steps, and seconds if that is more."""
-WINDOW, HORIZON = 5, 10
-"""The parts of a trajectory that are fitted at once and over which the gain is measured."""
-DIGITS, SAME = 9, 1e-6
-"""Of a native parameter that is set anew, and how near an option has to bring it."""
 
 Judge = Callable[[Array], tuple[float, bool]]
 """x⁺ of one of the two → the mean difference that is left, and whether it closes."""
@@ -85,7 +79,7 @@ def _question(simulation: Peer, reality: Peer, laboratory: Laboratory) -> str:
 def _found(simulation: Peer, reality: Peer, laboratory: Laboratory, judge: Judge, rebuild: Rebuild) -> Answer:
     from gapcert_diagnosis import diagnose
 
-    seconds = max(STEPS * simulation.system.period, SECONDS)
+    seconds = max(THRESHOLDS.played_steps * simulation.system.period, THRESHOLDS.played_seconds)
     axes, domain = laboratory.domain.axes, laboratory.domain
     ranges = {s.name: (float(low), float(high)) for s, low, high in zip(axes, domain.low, domain.high, strict=True)}
     try:
@@ -94,7 +88,7 @@ def _found(simulation: Peer, reality: Peer, laboratory: Laboratory, judge: Judge
             reality.system,
             ranges,
             seconds=seconds,
-            trajectories=TRAJECTORIES,
+            trajectories=THRESHOLDS.played_trajectories,
             relations=domain.relations,
             seed=laboratory.seed,
         )
@@ -102,8 +96,8 @@ def _found(simulation: Peer, reality: Peer, laboratory: Laboratory, judge: Judge
             model,
             _renamed(log, names),
             _effects(),
-            window=seconds / WINDOW,
-            horizons=[seconds / HORIZON],
+            window=seconds / THRESHOLDS.played_window,
+            horizons=[seconds / THRESHOLDS.played_horizon],
             seed=laboratory.seed,
         )
         left = judge(_after(found, names, simulation.system, laboratory))
@@ -114,7 +108,7 @@ def _found(simulation: Peer, reality: Peer, laboratory: Laboratory, judge: Judge
         return Answer()
     stated = {p.name: p.value for p in model.parameters}
     naming = _Naming(simulation, reality, found, {new: old for old, new in names.items()}, stated, rebuild)
-    several = [naming.changes(digits) for digits in (DIGITS, None)]
+    several = [naming.changes(digits) for digits in (THRESHOLDS.native_digits, None)]
     return Answer(tuple(several), all(c.options or c.natives for c in several[0]), left)
 
 
@@ -217,7 +211,7 @@ class _Naming:
         assert isinstance(extended, EngineModel)
         value = extended.natives().get(native.name, native.value)
         size = max(abs(value), abs(native.value))
-        if not native.low - SAME * size <= value <= native.high + SAME * size:
+        if not native.low - THRESHOLDS.same_native * size <= value <= native.high + THRESHOLDS.same_native * size:
             return None
         if digits is not None:
             value = round(value, digits - 1 - math.floor(math.log10(size))) if size else 0.0
@@ -245,5 +239,5 @@ def _option(peer: Peer, other: Peer, wanted: Mapping[str, float], rebuild: Rebui
 def _sets(wanted: Mapping[str, float], now: Mapping[str, float], after: Mapping[str, float]) -> bool:
     """Are all where they should be, within a small part of what they were or are to be?"""
     return after.keys() == wanted.keys() and all(
-        abs(after[n] - v) <= SAME * max(abs(v), abs(now[n])) for n, v in wanted.items()
+        abs(after[n] - v) <= THRESHOLDS.same_native * max(abs(v), abs(now[n])) for n, v in wanted.items()
     )

@@ -12,6 +12,7 @@ from typing import Any, final
 import numpy as np
 
 from gapcert.plugin import Build, Domain, Emit, Event, Model, Outcome, Shown, Stages, Study
+from gapcert_compare.thresholds import THRESHOLDS
 from gapcert_figures import Axis, CompareFigure, PairFigure
 
 from .laboratory import Laboratory, Peer, peers
@@ -19,9 +20,6 @@ from .matrix import cells, row
 from .pairs import Pair, Pairs, map_axes
 from .section import CompareConfig
 from .tables import write_tables
-
-ENOUGH = 0.99
-"""A change that takes away this share of a difference has named its cause."""
 
 
 @final
@@ -107,7 +105,7 @@ def closed(pair: Mapping[str, Any]) -> bool:
 
 
 def _closes(entry: Mapping[str, Any]) -> bool:
-    return bool(entry["closes"] or entry["reduction"] >= ENOUGH)
+    return bool(entry["closes"] or entry["reduction"] >= THRESHOLDS.closing_share)
 
 
 def _verdict(pairs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

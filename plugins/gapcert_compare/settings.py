@@ -9,14 +9,10 @@ from typing import Any, final
 
 from pydantic import BaseModel
 
+from gapcert_compare.thresholds import THRESHOLDS
 from gapcert_engines import Options, declared, flat, plain, short
 
 from .laboratory import Peer
-
-MOST, BEAM, DEPTH = 8, 3, 3
-"""Entries listed, changes that a search goes on from, and changes made together."""
-NOTHING = 1e-6
-"""The share of a difference that fitted numbers may leave where they explain all of it."""
 
 
 @final
@@ -92,11 +88,11 @@ class Trial:
     @property
     def size(self) -> int:
         """How much it asks for: another robot is no setting, and comes after all of them."""
-        return sum(2 * DEPTH if "robot" in c.options else 1 for c in self.changes)
+        return sum(2 * THRESHOLDS.joint_changes if "robot" in c.options else 1 for c in self.changes)
 
     def done(self, before: float) -> bool:
         """Does it close the difference, or leave nothing of it but the rounding of fitted numbers?"""
-        return self.closes or self.mean <= NOTHING * before
+        return self.closes or self.mean <= THRESHOLDS.nothing_left * before
 
     def summary(self, before: float) -> dict[str, Any]:
         """One entry of `explained_by`: reduction = 1 − mean after / mean before."""
@@ -146,7 +142,7 @@ def explain(
             keys = {c.key for c in together.changes}
             single = [t for t in single if t.changes[0].key in keys]
         named = [*([together] if together else []), *(t for t in diagnosed if t not in single), *single]
-    return [t.summary(before) for t in sorted(named, key=lambda t: _order(t, before))[:MOST]]
+    return [t.summary(before) for t in sorted(named, key=lambda t: _order(t, before))[: THRESHOLDS.listed_changes]]
 
 
 def _rank(trial: Trial) -> tuple[bool, float, int]:
@@ -166,8 +162,8 @@ def _together(
 ) -> Trial | None:
     """The best combination that improves on every single change, or None."""
     best = ranked[0]
-    beam = list(ranked[:BEAM])
-    for _ in range(DEPTH - 1):
+    beam = list(ranked[: THRESHOLDS.beam])
+    for _ in range(THRESHOLDS.joint_changes - 1):
         seen: dict[frozenset[str], Trial] = {}
         for start in beam:
             for c in changes:
@@ -176,7 +172,7 @@ def _together(
                     continue
                 if (t := attempt((*start.changes, c))) is not None and counts(t, start.mean):
                     seen[keys] = t
-        beam = sorted(seen.values(), key=_rank)[:BEAM]
+        beam = sorted(seen.values(), key=_rank)[: THRESHOLDS.beam]
         if not beam or not (beam[0].closes or counts(beam[0], best.mean)):
             break
         best = beam[0]

@@ -11,10 +11,10 @@ from typing import Any, Literal, final
 import numpy as np
 
 from gapcert.plugin import Effect, Emit, Event, Model, Recording, UsageError, registry, silent
+from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_recordings import JITTER, repairs
 
 from .data import time_units as clocks
-from .data.dataset import FEWEST as SHORTEST
 from .data.dataset import Dataset, Windows
 from .data.joint_limits import kept_within
 from .experiment.design import Limits, told_apart
@@ -28,13 +28,8 @@ from .residual.tests import evidence
 from .results import Cause, Diagnosis, Estimate, Misfit, Rival
 from .search.alternatives import Answer, answered, flags, smallest
 from .search.candidates import Candidate, Causes, Library
-from .search.criterion import TIE, keys, values
+from .search.criterion import keys, values
 from .search.engine_settings import Setting, across
-
-WINDOW, COUPLED = 1.2, 0.8  # s, with one coordinate and with several
-ENOUGH = 16_000  # measured values that are fitted
-GUARDED = 4  # windows at least: those that judge what the others suggest are among them
-LEAST, FEWEST = 30, 8  # samples in a window; windows
 
 
 def diagnose(
@@ -98,7 +93,7 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
     verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, design is not None, bool(doubt))
     lap("leftover")
     ties = [tuple(c.key for c in tie) for tie, _ in answer.ties]
-    ties += [(("engine-setting", s.runner_up.setting),) for s in settings if s.runner_up and s.margin < TIE]
+    ties += [(("engine-setting", s.runner_up.setting),) for s in settings if s.runner_up and s.margin < THRESHOLDS.tie_score]
     rest = leftover.unexplained(left) if verdict == "unexplained" else None
     plain = None if answer.plain is None else (f"setting {' and '.join(s.variant.setting for s in settings)}", answer.plain)
     return Diagnosis(
@@ -146,7 +141,12 @@ class _Data:
         held = replace(Dataset.of(model, with_past), sigma=fitted.sigma, spread=fitted.spread, since=since)
         _warned(problem.clock.emit, fitted, held)
         assumed = kept_within(model, fitted, held)
-        data = cls(library, fitted.windows(_length(fitted, model, problem.window)).thinned(ENOUGH, GUARDED), held, assumed)
+        data = cls(
+            library,
+            fitted.windows(_length(fitted, model, problem.window)).thinned(THRESHOLDS.fitted_values, THRESHOLDS.guard_windows),
+            held,
+            assumed,
+        )
         data.stretches(problem.horizons)  # refuses before the search is paid for
         return data
 
@@ -208,13 +208,14 @@ def _timed(model: Model, recording: Recording, horizons: Sequence[float]) -> Non
 
 def _length(measured: Dataset, model: Model, window: float | None) -> int:
     lengths = [len(y) - measured.history for y in measured.outputs]
-    usual = measured.samples(WINDOW if len(model.coordinates) < 2 else COUPLED)
+    usual = measured.samples(THRESHOLDS.window if len(model.coordinates) < 2 else THRESHOLDS.coupled_window)
     if window is None:
-        return max(LEAST, min(usual, sum(lengths) // FEWEST, min(lengths)))
-    if (own := measured.samples(window)) < SHORTEST:
+        return max(THRESHOLDS.usual_samples, min(usual, sum(lengths) // THRESHOLDS.usual_windows, min(lengths)))
+    if (own := measured.samples(window)) < THRESHOLDS.window_samples:
         raise UsageError(
-            f"diagnose.window: {window:g} s hold {own} samples, {measured.period:g} s apart; expected {SHORTEST} or more; give "
-            f"{SHORTEST * measured.period:g} s, or leave it out",
+            f"diagnose.window: {window:g} s hold {own} samples, {measured.period:g} s apart; expected "
+            f"{THRESHOLDS.window_samples} or more; give "
+            f"{THRESHOLDS.window_samples * measured.period:g} s, or leave it out",
             ("diagnose", "window"),
         )
     return own

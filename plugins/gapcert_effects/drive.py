@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from typing import ClassVar, final
 
 import gapcert as gc
+from gapcert_effects.thresholds import THRESHOLDS
 
 from .shared.experiments import FREE_DECAY, LEVELS, PLACES, SMALL_AND_LARGE
 from .shared.law import Law
 from .shared.sites import NEVER, driven, placed, spread, straight
 
-FEWEST, MOST = 1.3, 20.0  # periods over the range of motion: fewer are a polynomial in disguise
 _KEPT = "min(max({memory} - {f}, -{width}), {width})"
 
 
@@ -25,7 +25,7 @@ class Cogging(Law):
     parameters = (
         gc.plugin.EffectParameter("amplitude", {"force": 1}, (0.1,), -3.0, 3.0),
         # A period that is wrong by p²/range is out of step at one end: slopes need steps far below that.
-        gc.plugin.EffectParameter("period", {"position_range": 1}, (0.2,), 0.02, 1 / FEWEST, off=1.0, step=2e-4),
+        gc.plugin.EffectParameter("period", {"position_range": 1}, (0.2,), 0.02, 1 / THRESHOLDS.min_turns, off=1.0, step=2e-4),
         gc.plugin.EffectParameter("phase", {"angle": 1}, (0.1,), -10.0, 10.0),
     )
     equation = "f = amplitude·sin(2π·q/period + phase)"
@@ -40,7 +40,7 @@ class Cogging(Law):
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         """Periods half a turn apart at the ends of the range, so that one of them lies on the slope of every needle."""
         force, reach = 0.1 * scales["force"], scales["position_range"]
-        turns = [FEWEST * 1.05 + 0.5 * k for k in range(round(2 * (MOST - FEWEST)))]
+        turns = [THRESHOLDS.min_turns * 1.05 + 0.5 * k for k in range(round(2 * (THRESHOLDS.max_turns - THRESHOLDS.min_turns)))]
         return [(force, reach / n, phase) for n in turns for phase in (0.0, 0.5 * math.pi)]
 
     def canonical(self, values: Mapping[str, float]) -> dict[str, float]:

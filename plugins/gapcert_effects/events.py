@@ -6,11 +6,10 @@ from collections.abc import Mapping
 from typing import ClassVar, final
 
 import gapcert as gc
+from gapcert_effects.thresholds import THRESHOLDS
 
 from .shared.experiments import BOTH_WAYS
 from .shared.law import Law
-
-MOST = 80  # starts: the width of a push grows with the length of the recording
 
 
 @final
@@ -34,6 +33,6 @@ class ExternalPush(Law):
 
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         """Side by side over the whole recording, each as long as its distance to the next."""
-        width = max(0.1, scales["duration"] / MOST)
+        width = max(0.1, scales["duration"] / THRESHOLDS.push_starts)
         count = max(1, int(scales["duration"] / width))
         return [(0.5 * scales["force"], scales["start"] + k * width, width) for k in range(count)]

@@ -6,12 +6,11 @@ from collections.abc import Mapping
 from typing import ClassVar, final
 
 import gapcert as gc
+from gapcert_effects.thresholds import THRESHOLDS
 
 from .shared.experiments import BOTH_WAYS, FAST, FREE_DECAY, LEVELS, SECOND, SMALL_AND_LARGE
 from .shared.law import Law
 from .shared.sites import NEVER, spread
-
-LATEST, SLOWEST = 0.1, 1.0  # s
 
 
 def _lagging(target: str) -> tuple[str, str]:
@@ -33,7 +32,7 @@ class InputDelay(Law):
 
     name = "input-delay"
     site = "input"
-    parameters = (gc.plugin.EffectParameter("delay", {"time": 1}, (0.003, 0.02, 0.05), 0.0, LATEST),)
+    parameters = (gc.plugin.EffectParameter("delay", {"time": 1}, (0.003, 0.02, 0.05), 0.0, THRESHOLDS.latest_input),)
     equation = "u(t − delay) acts"
     adds: ClassVar = {"delay": "{delay}"}
     signature = "the response to fast inputs lags, the response to slow ones is right"
@@ -44,7 +43,7 @@ class InputDelay(Law):
     rivals: ClassVar = {"input-lag": FAST, "sensor-delay": SECOND, "input-rate-limit": SMALL_AND_LARGE, "backlash": FAST}
 
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
-        return [(t,) for t in spread(min(0.5 * scales["period"], 0.01), 0.9 * LATEST, 8)]
+        return [(t,) for t in spread(min(0.5 * scales["period"], 0.01), 0.9 * THRESHOLDS.latest_input, 8)]
 
 
 @final
@@ -102,7 +101,7 @@ class InputRateLimitedLag(Law):
     site = "input"
     parameters = (
         gc.plugin.EffectParameter("rate", {"input": 1, "time": -1}, (2.0, 10.0), 0.02, 2e4, off=NEVER),
-        gc.plugin.EffectParameter("time_constant", {"time": 1}, (0.01, 0.05), 0.0, SLOWEST),
+        gc.plugin.EffectParameter("time_constant", {"time": 1}, (0.01, 0.05), 0.0, THRESHOLDS.slowest_lag),
     )
     equation = "r acts, ṙ = clip((u − r)/time_constant, ±rate)"
     signature = "large steps become ramps with a rounded end, small ones arrive rounded"
@@ -138,7 +137,7 @@ class InputLag(Law):
 
     name = "input-lag"
     site = "input"
-    parameters = (gc.plugin.EffectParameter("time_constant", {"time": 1}, (0.005, 0.03, 0.1), 0.0, SLOWEST),)
+    parameters = (gc.plugin.EffectParameter("time_constant", {"time": 1}, (0.005, 0.03, 0.1), 0.0, THRESHOLDS.slowest_lag),)
     equation = "r acts, time_constant·ṙ = u − r"
     memory = gc.plugin.Memory("{time_constant}_reached", "{input}", _ARRIVED[1])
     adds: ClassVar = {"input": _ARRIVED[0]}

@@ -9,13 +9,13 @@ import numpy as np
 import numpy.typing as npt
 
 import gapcert as gc
+from gapcert_effects.thresholds import THRESHOLDS
 
 from .shared.experiments import CREEP, FAST, FREE_DECAY, PLACES, SECOND
 from .shared.lattice import lattice
 from .shared.law import Law
 from .shared.sites import spread
 
-LATEST = 0.1  # s
 FINEST = 1e-15  # of an output's unit: a resolution that rounds nothing
 
 
@@ -59,7 +59,7 @@ class SensorDelay(Law):
 
     name = "sensor-delay"
     site = "output"
-    parameters = (gc.plugin.EffectParameter("delay", {"time": 1}, (0.003, 0.02, 0.05), 0.0, LATEST),)
+    parameters = (gc.plugin.EffectParameter("delay", {"time": 1}, (0.003, 0.02, 0.05), 0.0, THRESHOLDS.latest_output),)
     equation = "y(t − delay) is seen"
     adds: ClassVar = {"output_delay": "{delay}"}
     signature = "this output comes late in all that it shows, whatever moves it"
@@ -69,7 +69,7 @@ class SensorDelay(Law):
     rivals: ClassVar = {"input-delay": SECOND, "input-lag": FAST}
 
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
-        return [(t,) for t in spread(min(0.5 * scales["period"], 0.01), 0.9 * LATEST, 8)]
+        return [(t,) for t in spread(min(0.5 * scales["period"], 0.01), 0.9 * THRESHOLDS.latest_output, 8)]
 
 
 @final

@@ -14,13 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.plugin import Array, Backend, Capability, Context, Parameter, Scene, Step, System, UsageError
+from gapcert_engines.thresholds import THRESHOLDS
 
 from .config import EngineConfig
 from .contract import ENDLESS, Engine, EngineWorld, Joint
 from .wiring import Lever, check_ranges, from_columns, step_period, to_columns, wire
-
-_SMALL_REMAINDER = 4
-"""Fewer rows than this are stepped one by one: a block costs as much as four single rows, a large one as copies / 12."""
 
 
 @final
@@ -205,7 +203,7 @@ class EngineBackend(Backend):
     ) -> tuple[Array, Array | None]:
         """Full blocks tiled, a large remainder as one block filled up with copies of its last row, the rest singly."""
         n = len(joints)
-        copies = self._tiles[0] if n >= _SMALL_REMAINDER and self.engine.tileable(values) else 1
+        copies = self._tiles[0] if n >= THRESHOLDS.small_remainder and self.engine.tileable(values) else 1
         if n < copies and values != self._asked:
             # To set all copies to new values costs more than to step a few rows, until they are asked for again.
             copies, self._asked = 1, dict(values)
@@ -216,7 +214,7 @@ class EngineBackend(Backend):
         if whole:
             out[:whole] = self._ready(copies, values).advance(joints[:whole], effort[:whole])[0]
         rest, forces = joints[whole:], effort[whole:]
-        if n - whole >= max(_SMALL_REMAINDER, copies // 12):
+        if n - whole >= max(THRESHOLDS.small_remainder, copies // 12):
             filled = np.minimum(np.arange(copies), n - whole - 1)
             out[whole:] = self._ready(copies, values).advance(rest[filled], forces[filled])[0][: n - whole]
         else:

@@ -12,6 +12,7 @@ import numpy as np
 
 from gapcert import Array, Context, Model, Parameter, UsageError, registry
 from gapcert.plugin import Extension, Scene, Variant, difference
+from gapcert_engines.thresholds import THRESHOLDS
 
 from .backend import EngineBackend
 from .config import EngineConfig
@@ -25,13 +26,9 @@ if TYPE_CHECKING:
     from .model_config import EngineModelConfig
 
 BESIDE = "not_in_the_file.txt"
-PROBES = 64
 PHYSICAL = {"joint_damping", "coulomb_friction", "frictionloss", "armature", "gravity", "friction", "restitution"}
 """Options that are native parameters of joints and contacts: causes of their own."""
-SUBSTEPS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20)
 SCHEMES = ("semi_implicit", "euler", "rk4")
-STEPS = (1 / 240, 0.002, 0.001)
-"""s: what PyBullet, MuJoCo, and DART and Gazebo step by where nothing is said."""
 POINT = 2e-6 / 3
 """m²: inertia per mass that Bullet gives a link without shapes, a box of 2 mm."""
 DRAG = 0.04
@@ -42,7 +39,8 @@ IMPEDANCE, STIFFEST, CONSTANT = 0.9, 0.95, 0.02
 
 @final
 class EngineModel(Model):
-    """x⁺ of a robot in a physics engine, by the equations of its bodies, checked by one step from PROBES random states.
+    """x⁺ of a robot in a physics engine, by the equations of its bodies, checked by one step from `engine_probes` random
+    states.
 
     An effect that the engine realises at a joint is written as the engine solves it (damping implicitly with the step).
     `backend` is the engine; `native` says what it calls a parameter or an effect. States are positions and velocities of all
@@ -117,12 +115,12 @@ class EngineModel(Model):
         """UsageError where the engine steps otherwise than the equations, unless these are meant to be otherwise."""
         if self.otherwise:
             return
-        without = dict.fromkeys(self._lacking, np.zeros(PROBES))
-        x, u, own = probes(self.inner, self.within, PROBES, without or None)
+        without = dict.fromkeys(self._lacking, np.zeros(THRESHOLDS.engine_probes))
+        x, u, own = probes(self.inner, self.within, THRESHOLDS.engine_probes, without or None)
         order = [[s.name for s in self.backend.states].index(s.name) for s in self.states]
         at = np.empty_like(x)
         at[:, order] = x
-        given = {n: np.full(PROBES, v) for n, v in self.natives().items()} or None
+        given = {n: np.full(THRESHOLDS.engine_probes, v) for n, v in self.natives().items()} or None
         engine = self.backend.step(at, u, parameters=given).x[:, order]
         moved = np.abs(difference(self.states, engine, x)).max(axis=0)
         # What friction stops would have moved on.
@@ -326,7 +324,7 @@ def _options(model: EngineModel) -> Iterator[Variant]:
     config: Any = model.backend.config
     have, own = flat(config), model.text()
     options = [(name, o) for name, o in declared(config) if name not in PHYSICAL | {"substeps"}]
-    options += [("substeps", {"substeps": k}) for k in SUBSTEPS if k != config.substeps]
+    options += [("substeps", {"substeps": k}) for k in THRESHOLDS.tried_substeps if k != config.substeps]
     here = {"robot": model.backend.engine.file, "period": f"{model.period!r} s"}
     for name, new in options:
         try:
@@ -363,7 +361,9 @@ def _stepped(model: EngineModel, now: Mapping[str, Any]) -> Iterator[tuple[str, 
     substeps, was = model.backend.substeps, now["integrator"]
     yield from (("integrator", s, was, {"integrator": s}) for s in SCHEMES if s != was)
     step = model.period / substeps
-    yield from (("time_step", s, step, {"period": f"{s * substeps!r} s"}) for s in STEPS if abs(s - step) > 1e-9 * step)
+    yield from (
+        ("time_step", s, step, {"period": f"{s * substeps!r} s"}) for s in THRESHOLDS.tried_steps if abs(s - step) > 1e-9 * step
+    )
 
 
 def _held(model: EngineModel, now: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any, dict[str, Any]]]:

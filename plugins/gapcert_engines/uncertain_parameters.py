@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from gapcert.plugin import Extension, Model, Parameter, site_units
+from gapcert_engines.thresholds import THRESHOLDS
 
 from .backend import EngineBackend
 from .contract import Engine
@@ -16,8 +17,6 @@ DAMPING = "implicit_damping"
 """Of a model, instead of the engine's: whether damping that a diagnosis finds is solved with the step."""
 DOUBTED = ("mass", "armature")
 """Native parameters that may be wrong though no tolerance is stated; of gravity, the components that are not zero."""
-
-_STRONG = 1e6  # N or N·m
 
 
 def known(backend: EngineBackend) -> dict[str, Parameter]:
@@ -54,5 +53,8 @@ def felt(model: Model, q: str) -> float:
     x, u = np.zeros((1, model.nx)), np.zeros((1, model.nu))
     column = [s.name for s in model.states].index(f"{q}_dot")
     # Far more than dry friction holds.
-    on, off = (pushed.step(x, u, parameters={push.name: np.array([f])}).x[0, column] for f in (2 * _STRONG, _STRONG))
-    return float(model.period * _STRONG / abs(on - off))
+    on, off = (
+        pushed.step(x, u, parameters={push.name: np.array([f])}).x[0, column]
+        for f in (2 * THRESHOLDS.strong_push, THRESHOLDS.strong_push)
+    )
+    return float(model.period * THRESHOLDS.strong_push / abs(on - off))

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any, final
 
 from gapcert import Interval, Parameter, StateSpec, UsageError
+from gapcert_equations.thresholds import THRESHOLDS
 
 from .config import Axis, EquationsConfig, MemoryConfig, OutputConfig, ParameterConfig, Problem, PythonConfig
 from .mechanics.dynamics import Dynamics
@@ -20,7 +21,6 @@ from .text.grammar import ExpressionError, parse
 from .text.sympy_text import expression, symbol
 from .text.units import SECOND, Checker
 
-_MAX_DELAY = 10_000
 _STEPPED = ("integrator", "substeps", "soft_friction", "friction_after_damping")
 
 
@@ -270,9 +270,9 @@ def _delays(config: EquationsConfig, tape: Tape, parameters: Sequence[Parameter]
     longest = [0.0 if t is None else float(t.hi) for t in tape.run(INTERVAL, tape.prepare(INTERVAL, ranges), [])]
     memory = [0 if t <= 0 else max(1, math.ceil(t / period - 1e-9)) for t in longest]
     for u, count in zip(config.input_delay, memory, strict=True):
-        if count > _MAX_DELAY:
+        if count > THRESHOLDS.delays:
             raise UsageError(
-                f"model.input_delay.{u}: {count} periods are longer than {_MAX_DELAY}; shorten the delay or its bounds"
+                f"model.input_delay.{u}: {count} periods are longer than {THRESHOLDS.delays}; shorten the delay or its bounds"
             )
     names = list(config.inputs)
     return Delays(tape, tuple(names.index(u) for u in config.input_delay), tuple(memory))

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from gapcert import Array, Context, Interval, MissingDependency, Model, StateSpec, UsageError
 from gapcert.plugin import Extension, Step, Values
+from gapcert_equations.thresholds import THRESHOLDS
 
 from .build import Definition, define
 from .config import EquationsConfig
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
     from .programs.rollouts import Compiled
 
 _CHUNK = 1 << 15
-_NEAR = 1e-9
 
 
 @final
@@ -309,7 +309,7 @@ class EquationsModel(Model):
         out = []
         for i, memory, delay in zip(delays.inputs, delays.memory, self._of_parameters(delays.tape, parameters), strict=True):
             ratio = np.maximum(0.0 if delay is None else delay, 0.0) / self.period
-            ratio = np.where(np.abs(ratio - np.round(ratio)) < _NEAR, np.round(ratio), ratio)
+            ratio = np.where(np.abs(ratio - np.round(ratio)) < THRESHOLDS.whole_ratio, np.round(ratio), ratio)
             if not (ratio <= memory).all():
                 longest = f"model.input_delay.{self.inputs[i].name}: {float(np.max(ratio)) * self.period:g} s"
                 raise UsageError(f"{longest} is longer than {memory} periods; give its parameter a bound `high` that covers it")

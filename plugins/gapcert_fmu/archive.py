@@ -9,11 +9,9 @@ import zlib
 from pathlib import Path, PurePosixPath
 
 from gapcert import UsageError
+from gapcert_fmu.thresholds import THRESHOLDS
 
 DESCRIPTION = "modelDescription.xml"
-ENTRIES_AT_MOST = 20_000
-DESCRIPTION_AT_MOST = 64 << 20
-"""Bytes."""
 _CHUNK = 1 << 20
 _DECLARES = re.compile(rb"<!\s*(DOCTYPE|ENTITY)", re.I)
 """Of an XML: entities that a parser would expand or fetch. No model description has any."""
@@ -27,8 +25,8 @@ def unpack(path: Path, folder: Path, megabytes: int) -> None:
     try:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
-            if len(entries) > ENTRIES_AT_MOST:
-                raise UsageError(f"file: {path} has {len(entries)} entries; expected at most {ENTRIES_AT_MOST}")
+            if len(entries) > THRESHOLDS.archive_entries:
+                raise UsageError(f"file: {path} has {len(entries)} entries; expected at most {THRESHOLDS.archive_entries}")
             names = set[str]()
             for entry in entries:
                 _check(path, entry, names)
@@ -42,7 +40,7 @@ def unpack(path: Path, folder: Path, megabytes: int) -> None:
     except (zipfile.BadZipFile, EOFError, zlib.error, RuntimeError, OSError) as error:
         raise UsageError(f"file: {path} cannot be unpacked: {error}; expected a whole FMU, a zip archive") from None
     text = (folder / DESCRIPTION).read_bytes()
-    if len(text) > DESCRIPTION_AT_MOST or _DECLARES.search(text) or b"\0" in text:
+    if len(text) > THRESHOLDS.description_bytes or _DECLARES.search(text) or b"\0" in text:
         raise UsageError(
             f"file: {path}: its {DESCRIPTION} declares entities, or is no plain UTF-8; expected XML without a DOCTYPE"
         )

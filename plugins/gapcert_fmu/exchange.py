@@ -7,12 +7,10 @@ from typing import final
 import numpy as np
 
 from gapcert import Array, UsageError
+from gapcert_fmu.thresholds import THRESHOLDS
 
 from .instance import Instance, pointer
 
-EVENTS_AT_MOST = 1000
-"""In one period; more is chattering."""
-_HALVINGS = 50
 _STAGES = {"euler": ((0.0,), (1.0,)), "rk4": ((0.0, 0.5, 0.5, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6))}
 """Where in the step each derivative is taken, along the one before; and its weight."""
 
@@ -48,8 +46,8 @@ class Exchange:
                 if ended:
                     raise UsageError(f"the FMU ended the simulation at {t:.9g} s; expected it to go on for the whole period")
                 if asked or crossed or (following is not None and t >= following):
-                    if (events := events + 1) > EVENTS_AT_MOST:
-                        raise UsageError(f"more than {EVENTS_AT_MOST} events within {period:.9g} s; expected fewer")
+                    if (events := events + 1) > THRESHOLDS.events:
+                        raise UsageError(f"more than {THRESHOLDS.events} events within {period:.9g} s; expected fewer")
                     self.fmu.enterEventMode()
                     following = self._discrete()
                     self.fmu.enterContinuousTimeMode()
@@ -63,7 +61,7 @@ class Exchange:
             self._put(to, after)
             return to, after, False
         low, high = t, to
-        for _ in range(_HALVINGS):
+        for _ in range(THRESHOLDS.event_halvings):
             middle = 0.5 * (low + high)
             if not low < middle < high:
                 break
@@ -105,12 +103,12 @@ class Exchange:
     def _discrete(self) -> float | None:
         """Events until nothing changes; the time of the next one, if it is known."""
         update = self.fmu.updateDiscreteStates if self.instance.description.newer else self.fmu.newDiscreteStates
-        for _ in range(EVENTS_AT_MOST):
+        for _ in range(THRESHOLDS.events):
             again, ended, _, _, known, when = update()
             if ended:
                 raise UsageError("the FMU ended the simulation at an event; expected it to go on for the whole period")
             if not again:
                 return float(when) if known else None
         raise UsageError(
-            f"the FMU's discrete states change more than {EVENTS_AT_MOST} times at one event; expected that it settles"
+            f"the FMU's discrete states change more than {THRESHOLDS.events} times at one event; expected that it settles"
         )

@@ -12,11 +12,11 @@ import numpy as np
 from fmpy import fmi2, fmi3
 
 from gapcert import Array, UsageError
+from gapcert_fmu.thresholds import THRESHOLDS
 
 from .description import INTEGERS, REALS, Description
 
 Restart = Literal["snapshot", "reset", "instantiate"]
-_SAID_AT_MOST = 20
 
 
 def pointer(array: Array) -> ctypes.Array[ctypes.c_double]:
@@ -166,7 +166,7 @@ class Instance:
 
     def _hear(self, status: int, message: bytes | None) -> None:
         if status and message:
-            self.said = [*self.said[-_SAID_AT_MOST:], " ".join(message.decode(errors="replace").split())]
+            self.said = [*self.said[-THRESHOLDS.kept_messages :], " ".join(message.decode(errors="replace").split())]
 
     def _preset(self, variable: Any, value: float | bool | str) -> None:
         references, kind = [variable.valueReference], variable.type

@@ -19,6 +19,7 @@ from fmpy.fmi1 import FMICallException
 from gapcert import Array, Backend, Context, System, UsageError
 from gapcert.plugin import Step
 from gapcert_engines import check_ranges, muted, step_period
+from gapcert_fmu.thresholds import THRESHOLDS
 
 from .archive import unpack
 from .config import FmuConfig
@@ -28,10 +29,6 @@ from .instance import Instance, Numbers, Restart
 from .wiring import wire
 
 _Option = Literal["hidden", "parameters"]
-_PERIODS = 4
-"""Through which an FMU is asked whether it remembers more than its states."""
-_REMEMBERS = 1e-9
-"""Relative; a smaller difference is rounding."""
 
 
 @final
@@ -233,9 +230,12 @@ class FmuBackend(Backend):
         held = row[width:]
         pushed = held + 0.1 * (np.abs(held) + (0.0 if held.any() else 1.0))
         # The inputs of model exchange stay: it is asked for one long period.
-        inputs = [held if k % 2 or self.description.interface == "model-exchange" else pushed for k in range(_PERIODS)]
+        inputs = [
+            held if k % 2 or self.description.interface == "model-exchange" else pushed
+            for k in range(THRESHOLDS.memory_periods)
+        ]
         on = self._going_on(row[:width], inputs)
-        scale, limit = np.maximum(np.abs(row[:width]), 1e-6), _REMEMBERS + 100 * (self._tolerance or 0.0)
+        scale, limit = np.maximum(np.abs(row[:width]), 1e-6), THRESHOLDS.memory_change + 100 * (self._tolerance or 0.0)
         instance, state = self._make(self._restart), row[:width]
         try:
             for k, u in enumerate(inputs):

@@ -16,7 +16,7 @@ from gapcert.plugin import Array, Interval
 
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = float(np.finfo(np.float64).tiny)
-_POINTS = 1 << 16
+_POINTS = 1 << 16  # of a quadrature over all axes, at most; chosen, not measured
 
 
 def _tanh_slope(x: Interval) -> Interval:

@@ -26,7 +26,7 @@ from .bounded_function import Function
 Index = npt.NDArray[np.intp]
 
 _EPS = float(np.finfo(np.float64).eps)
-_BATCH = 4096
+_BATCH = 4096  # boxes that are cut in a round; chosen, not measured
 _NEAR = 24  # samples that a box looks at
 
 

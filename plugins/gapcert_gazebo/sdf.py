@@ -18,7 +18,7 @@ _TYPES: dict[str, Literal["revolute", "prismatic", "fixed"]] = {
     "prismatic": "prismatic",
     "fixed": "fixed",
 }
-_NEVER = 1e15
+_NEVER = 1e15  # larger ones are no limits, as in SDF
 _GROUND = """<model name="gapcert_ground"><static>true</static><link name="plane"><collision name="plane">
 <geometry><plane><normal>0 0 1</normal></plane></geometry>
 <surface><friction><ode><mu>{mu!r}</mu><mu2>{mu!r}</mu2></ode></friction></surface></collision></link></model>

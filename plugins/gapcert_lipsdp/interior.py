@@ -16,12 +16,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky, lapack, solve_triangular
 
 from gapcert import Array
-
-TOLERANCE = 1e-9  # of ρ: the gap between both sides at which the method ends
-ROUNDS, BACK = 100, 0.8
-BEGIN = 1.3  # times the smallest ρ that the first multipliers admit
-NEAR, NEARER, LATE = 0.95, 0.98, 1e-6  # share of the way to the boundary; the second where the mean product is below `LATE`
-KRYLOV, SHARP, FREE = 60, 0.02, 0.9  # steps to the smallest eigenvalue; its relative error; above −FREE a whole step is inside
+from gapcert_lipsdp.thresholds import THRESHOLDS
 
 
 @final
@@ -48,7 +43,7 @@ def first_multipliers(weights: Sequence[Array]) -> tuple[list[float], float]:
     return found[::-1], float(np.linalg.eigvalsh(p)[-1])
 
 
-def solved(weights: Sequence[Array], tolerance: float = TOLERANCE) -> Solved:
+def solved(weights: Sequence[Array], tolerance: float = THRESHOLDS.interior_gap) -> Solved:
     """weights W_0 … W_l, the first in units of the norm of the inputs; LinAlgError where floats allow no start."""
     multipliers, rho = first_multipliers(weights)
     # Of powers of two, so that the matrix of the scaled network is that of the given one to the bit.
@@ -75,7 +70,7 @@ class _Method:
         ]
         values, rho = first_multipliers(weights)
         self.lam = np.concatenate([np.full(k, v) for k, v in zip(sizes[1:-1], values, strict=True)])
-        self.rho = BEGIN * rho
+        self.rho = THRESHOLDS.interior_start * rho
         self.low = _factor(self.matrix(self.rho, self.lam))
         if self.low is None:
             raise LinAlgError("the first multipliers are not inside: the weights are too far apart")
@@ -159,10 +154,10 @@ class _Method:
     def _reach(self, low: Array, step: Array) -> float:
         """The largest a, or a little less, with LLᵀ + a·step ⪰ 0: by Lanczos steps with L⁻¹ step L⁻ᵀ."""
         q = self.random.standard_normal(len(low))
-        basis, a, b = np.empty((KRYLOV, len(low))), list[float](), list[float]()
+        basis, a, b = np.empty((THRESHOLDS.krylov_steps, len(low))), list[float](), list[float]()
         q /= np.linalg.norm(q)
         least = -np.inf
-        for k in range(min(KRYLOV, len(low))):
+        for k in range(min(THRESHOLDS.krylov_steps, len(low))):
             basis[k] = q
             v = step @ solve_triangular(low, q, lower=True, trans=1, check_finite=False)
             v = solve_triangular(low, v, lower=True, check_finite=False)
@@ -173,7 +168,7 @@ class _Method:
             values, vectors = np.linalg.eigh(np.diag(a) + np.diag(b, 1) + np.diag(b, -1))
             error = size * abs(float(vectors[-1, 0]))
             least = float(values[0]) - error
-            if error < SHARP * abs(float(values[0])) or least > -FREE or size == 0:
+            if error < THRESHOLDS.eigenvalue_error * abs(float(values[0])) or least > -THRESHOLDS.free_eigenvalue or size == 0:
                 break
             b.append(size)
             q = v / size
@@ -181,7 +176,7 @@ class _Method:
 
     def run(self, tolerance: float) -> Solved:
         done = 0
-        while done < ROUNDS:
+        while done < THRESHOLDS.interior_rounds:
             one, others = self.traces(self.dual)
             constant = self.constant(self.dual)
             product = self.rho * one + float(self.lam @ others) + constant
@@ -206,15 +201,15 @@ class _Method:
         centre = max(min(1.0, max(float(there) / self.size / mean, 0.0) ** 2), 1e-8)
         curve = dual @ self.moved(rho, lam, self.inverse)
         rho, lam, dual = self.direction(normal, centre * mean * self.inverse - (curve + curve.T) / 2)
-        share = NEAR if mean > LATE else NEARER
+        share = THRESHOLDS.boundary_step if mean > THRESHOLDS.late_product else THRESHOLDS.late_boundary_step
         p, d = (min(1.0, share * a) if a < 1 else 1.0 for a in self.lengths(rho, lam, dual))
         low, root = None, None
         while low is None and d > 1e-8:
             low = _factor(self.matrix(self.rho + d * rho, self.lam + d * lam))
-            d = d if low is not None else BACK * d
+            d = d if low is not None else THRESHOLDS.step_back * d
         while root is None and p > 1e-8:
             root = _factor(self.dual + p * dual)
-            p = p if root is not None else BACK * p
+            p = p if root is not None else THRESHOLDS.step_back * p
         if low is None or root is None:
             return False
         self.rho, self.lam, self.dual = self.rho + d * rho, self.lam + d * lam, self.dual + p * dual

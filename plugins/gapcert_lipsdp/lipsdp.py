@@ -9,12 +9,12 @@ import numpy as np
 from scipy.linalg import LinAlgError
 
 from gapcert import Array
+from gapcert_lipsdp.thresholds import THRESHOLDS
 from gapcert_networks import NetworkCertifier, Proposal
 
 from . import interior, spectraplex
 
 MIXED = tuple(10.0 ** (k / 2) for k in range(-22, -3))  # of ρ, what the start adds to it in what is proposed
-ABOVE = 1.3  # times the smallest ρ of the start, so that it lies inside
 
 
 @final
@@ -23,7 +23,7 @@ class LipSDP(NetworkCertifier):
 
     name = "lipsdp"
 
-    def __init__(self, tolerance: float = interior.TOLERANCE) -> None:
+    def __init__(self, tolerance: float = THRESHOLDS.interior_gap) -> None:
         self.tolerance = tolerance
 
     def propose(self, weights: Sequence[Array]) -> tuple[Iterable[Proposal], float]:
@@ -37,7 +37,7 @@ class LipSDP(NetworkCertifier):
 
     def _deep(self, weights: Sequence[Array]) -> tuple[Iterable[Proposal], float]:
         values, rho = interior.first_multipliers(weights)
-        start = Proposal(tuple(np.full(len(w), v) for w, v in zip(weights, values, strict=False)), ABOVE * rho)
+        start = Proposal(tuple(np.full(len(w), v) for w, v in zip(weights, values, strict=False)), THRESHOLDS.start_above * rho)
         try:
             found = interior.solved(weights, self.tolerance)
         except LinAlgError:

@@ -17,20 +17,12 @@ from scipy.linalg import lapack
 from scipy.optimize import minimize
 
 from gapcert import Array
+from gapcert_lipsdp.thresholds import THRESHOLDS
 
-ROUNDS, CORRECTIONS = 300, 20
-RESTARTS, ENOUGH = 3, 5e-9  # further searches, from where the last one stopped, until both sides are this close
-STEPS, CLOSE, HALVED, SAME = (
-    20,
-    1e-10,
-    8,
-    1e-14,
-)  # of Newton's method, how close it comes, how often a step is halved, what rounding may take
-FEW, BLOCK = 66, 4096  # unknowns up to which Newton's method is the faster one; neurons that are taken at once
+BLOCK = 4096  # neurons that are taken at once
 MORE = np.array([0.0, *(10.0**k for k in range(-13, -2))])[:, None, None]  # relative, by which multipliers are enlarged
 ROUNDING = 2e-15  # per term of a sum, what the proof takes from q
 TINY = float(np.finfo(np.float64).tiny)
-REGULAR = 1e-12  # of the largest, what every eigenvalue of the first X has at least
 
 
 @final
@@ -53,27 +45,27 @@ def solved(first: Array, last: Array) -> OneLayer:
     columns = columns if used.all() else np.ascontiguousarray(columns[:, used])
     square = columns @ columns.T
     x = square / np.trace(square)
-    if n * (n + 1) // 2 <= FEW:
+    if n * (n + 1) // 2 <= THRESHOLDS.newton_unknowns:
         x, length = _newton(columns, x)
         total, upper = _sides(columns, length)
-        if upper <= 0.5 * total * (1 + ENOUGH):
+        if upper <= 0.5 * total * (1 + THRESHOLDS.search_gap):
             return _multipliers(weight, used, length, upper)
     rows = np.ascontiguousarray(columns.T)
     value, vectors = np.linalg.eigh(x)
-    at = vectors * np.sqrt(np.maximum(value, REGULAR * value[-1]))
-    for _ in range(RESTARTS):
+    at = vectors * np.sqrt(np.maximum(value, THRESHOLDS.least_eigenvalue * value[-1]))
+    for _ in range(THRESHOLDS.search_restarts):
         found = minimize(
             _negative,
             (at / np.linalg.norm(at)).ravel(),
             (rows,),
             jac=True,
             method="L-BFGS-B",
-            options={"maxiter": ROUNDS, "ftol": 1e-16, "gtol": 1e-12, "maxcor": CORRECTIONS},
+            options={"maxiter": THRESHOLDS.search_rounds, "ftol": 1e-16, "gtol": 1e-12, "maxcor": THRESHOLDS.corrections},
         )
         at = found.x.reshape(n, -1)
         length = np.linalg.norm(rows @ (at / np.linalg.norm(at)), axis=1) + 1e-300
         total, upper = _sides(columns, length)
-        if upper <= 0.5 * total * (1 + ENOUGH):
+        if upper <= 0.5 * total * (1 + THRESHOLDS.search_gap):
             break
     return _multipliers(weight, used, length, upper)
 
@@ -99,16 +91,16 @@ def _newton(columns: Array, x: Array) -> tuple[Array, Array]:
     y = −(∇²F)⁻¹ svec I.
     """
     length = _lengths(columns, x)
-    for _ in range(STEPS):
+    for _ in range(THRESHOLDS.newton_steps):
         total, inverse = float(length.sum()), 1 / length
-        if 2 * _largest(0.5 * (columns * inverse) @ columns.T) <= total * (1 + CLOSE) ** 2:
+        if 2 * _largest(0.5 * (columns * inverse) @ columns.T) <= total * (1 + THRESHOLDS.newton_gap) ** 2:
             break
         step = _step(columns, inverse, x)
         if step is None:
             break
-        for _ in range(HALVED):
+        for _ in range(THRESHOLDS.newton_halvings):
             tried = (x + step) / np.trace(x + step)
-            if lapack.dpotrf(tried)[1] == 0 and (there := _lengths(columns, tried)).sum() >= total * (1 - SAME):
+            if lapack.dpotrf(tried)[1] == 0 and (there := _lengths(columns, tried)).sum() >= total * (1 - THRESHOLDS.rounding):
                 break
             step = step / 2
         else:

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.plugin import Array, Interval, Model, Recording, UsageError
+from gapcert_monitor.thresholds import THRESHOLDS
 from gapcert_recordings import Transitions, axes
 
 from .certified import Certified as Certified
@@ -19,10 +20,6 @@ from .monitor import Monitor as Monitor
 from .monitor import Observation as Observation
 from .monitor import rate_limit
 
-LISTED = 1_000
-FEWEST, TURNED = 30, -0.25  # neighbours, and their correlation from which on residuals look like noise in the measurement
-BLOCKS, SURE, SHARE = 20, 0.999, 0.05  # of the drift: stretches, the level at which a trend is told, and the least share of γ
-
 
 @final
 @dataclass(frozen=True)
@@ -30,7 +27,7 @@ class Check:
     """What a log says of a certificate. `points` transitions began in Z, `outside_domain` did not and say nothing.
 
     violations: [{"t", "state", "size", "gamma", "trajectory"}], |r_i| > γ_i by more than the stated noise allows, the
-    `LISTED` largest excesses in the order of time; `violated` counts the transitions. rate = violated / points; rate_limit:
+    `listed` largest excesses in the order of time; `violated` counts the transitions. rate = violated / points; rate_limit:
     its upper limit at 95 % (Clopper–Pearson), if transitions were independent. drift: per state, the change of r at a given z
     from the beginning to the end of the log {"change", "error", "trend"}, None with too few points. `hint`: what to do next.
     """
@@ -110,7 +107,7 @@ def _listed(
     steps: Transitions, inside: npt.NDArray[np.bool_], r: Array, gamma: Array, excess: Array, model: Model, titles: list[str]
 ) -> tuple[dict[str, Any], ...]:
     row, state = np.nonzero(excess > 0)
-    worst = np.sort(np.argsort(-excess[row, state] / np.maximum(gamma[row, state], 1e-300), kind="stable")[:LISTED])
+    worst = np.sort(np.argsort(-excess[row, state] / np.maximum(gamma[row, state], 1e-300), kind="stable")[: THRESHOLDS.listed])
     t, of = steps.t[inside], steps.trajectory[inside]
     return tuple(
         {
@@ -127,12 +124,12 @@ def _listed(
 def _drift(r: Array, gamma: Array, z: Array) -> dict[str, Any] | None:
     """How much r (without what is known of it) changes along the log: its slope over time beside a quadratic function of z.
 
-    What neighbours share counts once: the slope's error comes from sums over `BLOCKS` stretches. A trend is one that is sure
-    and at least `SHARE` of the median γ.
+    What neighbours share counts once: the slope's error comes from sums over `drift_stretches` stretches. A trend is one that
+    is sure and at least `drift_share` of the median γ.
     """
     from scipy.stats import t as student
 
-    if len(r) < 4 * BLOCKS or not np.isfinite(r).all():
+    if len(r) < 4 * THRESHOLDS.drift_stretches or not np.isfinite(r).all():
         return None
     spread = z.std(axis=0)
     w = (z - z.mean(axis=0))[:, spread > 0] / spread[spread > 0]
@@ -145,10 +142,10 @@ def _drift(r: Array, gamma: Array, z: Array) -> dict[str, Any] | None:
     time, left = (both - design @ np.linalg.lstsq(design, both, rcond=None)[0]).T
     size = float(time @ time)
     change = float(time @ left) / size
-    scores = [float(s.sum()) for s in np.array_split(time * (left - change * time), BLOCKS)]
+    scores = [float(s.sum()) for s in np.array_split(time * (left - change * time), THRESHOLDS.drift_stretches)]
     error = float(np.linalg.norm(scores)) / size
-    sure = abs(change) > error * float(student.ppf((1 + SURE) / 2, BLOCKS - 1))
-    return {"change": change, "error": error, "trend": bool(sure and abs(change) > SHARE * np.median(gamma))}
+    sure = abs(change) > error * float(student.ppf((1 + THRESHOLDS.drift_level) / 2, THRESHOLDS.drift_stretches - 1))
+    return {"change": change, "error": error, "trend": bool(sure and abs(change) > THRESHOLDS.drift_share * np.median(gamma))}
 
 
 def _hint(found: Check, noisy: Mapping[str, float]) -> str:
@@ -181,12 +178,12 @@ def _noisy(steps: Transitions, r: Array, inside: npt.NDArray[np.bool_], model: M
     −1/2, and what the model lacks, which changes little from one step to the next, by more than 0.
     """
     first, second = steps.followed(inside, model.period)
-    if len(first) < FEWEST:
+    if len(first) < THRESHOLDS.neighbours:
         return {}
     centred = r - r.mean(axis=0)
     size = np.maximum((centred**2).mean(axis=0), np.finfo(float).tiny)
     turned = (centred[first] * centred[second]).mean(axis=0) / size
-    return {s.name: float(np.sqrt(size[i] / 2)) for i, s in enumerate(model.states) if turned[i] < TURNED}
+    return {s.name: float(np.sqrt(size[i] / 2)) for i, s in enumerate(model.states) if turned[i] < THRESHOLDS.noise_correlation}
 
 
 def in_words(found: Check) -> list[str]:

@@ -7,14 +7,13 @@ from typing import NamedTuple, final
 import numpy as np
 
 from gapcert.plugin import Array
+from gapcert_monitor.thresholds import THRESHOLDS
 from gapcert_recordings import axes
 
 from .certified import Certified
 
-CONFIDENCE = 0.95
 
-
-def rate_limit(k: int, n: int, confidence: float = CONFIDENCE) -> float:
+def rate_limit(k: int, n: int, confidence: float = THRESHOLDS.confidence) -> float:
     """One-sided upper limit of a probability of which k of n independent trials were hits (Clopper and Pearson 1934)."""
     from scipy.stats import beta
 

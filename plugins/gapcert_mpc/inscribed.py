@@ -8,8 +8,7 @@ from typing import NamedTuple, final
 import numpy as np
 
 from gapcert.plugin import Bools, Ints
-
-SEEDS = 48
+from gapcert_mpc.thresholds import THRESHOLDS
 
 
 @final
@@ -51,7 +50,7 @@ def inscribed(winning: Bools, room: Ints, most: int) -> list[Box]:
     cells = np.argwhere(winning)
     if not len(cells):
         return []
-    seeds = cells[np.unique(rng.integers(len(cells), size=SEEDS))]
+    seeds = cells[np.unique(rng.integers(len(cells), size=THRESHOLDS.inscribed_seeds))]
     orders = [None, *range(winning.ndim)] if winning.ndim > 1 else [None]
     grown = {tuple(np.concatenate(_grown(sums, winning.shape, seed, j)).tolist()) for seed in seeds for j in orders}
     n = winning.ndim

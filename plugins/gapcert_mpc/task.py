@@ -13,6 +13,7 @@ import numpy as np
 
 from gapcert import Array, Domain, Goal, SynthesisProblem
 from gapcert.plugin import Pulse, Synthesizer
+from gapcert_mpc.thresholds import THRESHOLDS
 
 from .config import Soft, Terminal
 from .controller import MpcController
@@ -24,7 +25,6 @@ from .program.tube import riccati, unreached
 
 Linearisation = Literal["once", "successive"]
 STARTS: dict[Linearisation, int] = {"once": 400, "successive": 64}
-REST = 1e-3  # what it costs that a plan ends away from the reference, besides the plan itself
 
 
 class MpcOptions(Synthesizer):
@@ -140,7 +140,7 @@ class Task:
         # The scale of a cost is free; near 1 the solvers find their step sizes best.
         soft = [max(given.linear, given.quadratic) for given in self.options.soft.values()]
         scale = 1 / max(np.abs(X).max(), Q.max(), R.max(), *soft)
-        return Weights(np.diag(Q) * scale, np.diag(R) * scale, X * scale, np.eye(nx) * REST * scale)
+        return Weights(np.diag(Q) * scale, np.diag(R) * scale, X * scale, np.eye(nx) * THRESHOLDS.rest_weight * scale)
 
     def drawn(self, rng: np.random.Generator, count: int) -> Array:
         """States of the goal."""

@@ -11,13 +11,11 @@ from typing import final
 import numpy as np
 
 from gapcert.plugin import Array, UsageError
+from gapcert_networks.thresholds import THRESHOLDS
 
 from .network import Network
 from .network_constant import proved
 from .scaling import balanced, shifted, trimmed
-
-CLOSE = 1e-10  # of ρ: what is not worth a further proof
-APART = 1e100  # units further apart than this leave no room for the squares of both
 
 
 @final
@@ -73,9 +71,10 @@ class NetworkCertifier(ABC):
     def bound(self, network: Network, units: Sequence[float] | Array | None = None, *, axes: bool = True) -> NetworkBound:
         """units s (n_in,), 1 by default: the norm of the inputs is √(Σ s_k² x_k²). axes: also for each input alone."""
         s = np.ones(network.n_in) if units is None else np.array(units, dtype=np.float64)
-        if s.shape != (network.n_in,) or not (np.isfinite(s).all() and (s > 0).all()) or s.max() > APART * s.min():
+        if s.shape != (network.n_in,) or not (np.isfinite(s).all() and (s > 0).all()) or s.max() > THRESHOLDS.apart * s.min():
             raise UsageError(
-                f"network units: found {s.tolist()}; expected {network.n_in} positive numbers within {APART:g} of each other; "
+                f"network units: found {s.tolist()}; expected {network.n_in} positive numbers within "
+                f"{THRESHOLDS.apart:g} of each other; "
                 f"give one per input"
             )
         value, lower, multipliers, method = self._joint(network, network.weights[0], s)
@@ -114,10 +113,10 @@ class NetworkCertifier(ABC):
         proposals = sorted((p for p in given if math.isfinite(p.square) and p.square > 0), key=lambda p: p.square)
         best: tuple[float, Sequence[Array]] | None = None
         for i, p in enumerate(proposals):
-            if best is not None and p.square * (1 + CLOSE) >= best[0] ** 2:
+            if best is not None and p.square * (1 + THRESHOLDS.gain) >= best[0] ** 2:
                 break
             # What the next one may prove without more is not worth a larger addition to this one.
-            room = {"most": max(CLOSE, proposals[i + 1].square / p.square - 1)} if i + 1 < len(proposals) else {}
+            room = {"most": max(THRESHOLDS.gain, proposals[i + 1].square / p.square - 1)} if i + 1 < len(proposals) else {}
             value = proved(weights, p.multipliers, p.square, units, **room)
             if value is not None and (best is None or value < best[0]):
                 best = value, p.multipliers

@@ -24,6 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.plugin import Array
+from gapcert_networks.thresholds import THRESHOLDS
 
 from .network_slopes import EPS, PIECEWISE, TINY, gates, lines
 from .positive_definite import gamma
@@ -32,11 +33,6 @@ from .positive_definite import gamma
 _Block = tuple[Array, Array, Array, Array | None]
 # Per layer (h, 1): 1 or −1 where all that is asked about has the pre-activation on that side of 0, else 0.
 Held = list[npt.NDArray[np.int8]]
-
-STEPS = 3  # of X
-HOPE, STUCK = 1.15, 0.9  # times the target and the bound before: between them further steps are not worth their time
-FLOOR = 1e-14  # of vᵀv: the least vᵀXv that is used
-LARGE = 1e60  # sums over paths beyond it, or below its inverse, leave no room for squares
 
 
 @final
@@ -80,7 +76,9 @@ class Cells:
         self.size, self.moves = float(paths[0]), bool(np.all(moved))
         sizes = [float(np.max(np.abs(a))) for a in [*large, back, *self.W, *self.b, self.last]]
         # NaN is refused too.
-        self.usable = not self.moves or (max(sizes) * total <= LARGE and 1 / LARGE <= self.size <= LARGE)
+        self.usable = not self.moves or (
+            max(sizes) * total <= THRESHOLDS.path_sums and 1 / THRESHOLDS.path_sums <= self.size <= THRESHOLDS.path_sums
+        )
         self.error = gamma(2 * total + 32 * (self.depth + 1) + self.n**2)
         self.margin = 4 * (self.depth + 2) ** 3 * self.error * self.size * (1 + 1e-6)
 
@@ -254,10 +252,10 @@ class Cells:
         for t, (_, _, P, _) in zip(times, blocks, strict=True):
             score += _combined(t / (_spread(P, r) + TINY), np.abs(P)) * r.T
         rows = np.arange(k)
-        for _ in range(STEPS - 1):
+        for _ in range(THRESHOLDS.cell_steps - 1):
             keep = np.arange(len(rows))
             if before is not None:
-                useful = (best < (HOPE * target) ** 2) | (best > (STUCK * before) ** 2)
+                useful = (best < (THRESHOLDS.cell_hope * target) ** 2) | (best > (THRESHOLDS.cell_stuck * before) ** 2)
                 keep = np.flatnonzero(((best > target**2) & useful)[rows])
             if len(keep) == 0:
                 break
@@ -345,7 +343,7 @@ def _reach(spread: Array | float, q: Array, z: Array, n: int) -> Array:
 
 def _roots(square: Array, whole: Array) -> Array:
     """√(vᵀXv), kept away from 0 beside vᵀv."""
-    return np.sqrt(np.maximum(square, FLOOR * whole + 1e-200))
+    return np.sqrt(np.maximum(square, THRESHOLDS.least_square * whole + 1e-200))
 
 
 def _spread(P: Array, r: Array) -> Array:

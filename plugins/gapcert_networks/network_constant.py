@@ -13,17 +13,21 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.plugin import Array
+from gapcert_networks.thresholds import THRESHOLDS
 
 from .positive_definite import SPARE, UNIT, gamma, positive_definite
 
 Integers = npt.NDArray[np.int64]
 
-SLACK, MOST = 1e-13, 1e-6  # of ρ: first and, by default, last of what is added until the proof succeeds
 TINY = float(np.finfo(np.float64).tiny)
 
 
 def proved(
-    weights: Sequence[Array], multipliers: Sequence[Array], rho: float, units: Array | None = None, most: float = MOST
+    weights: Sequence[Array],
+    multipliers: Sequence[Array],
+    rho: float,
+    units: Array | None = None,
+    most: float = THRESHOLDS.last_slack,
 ) -> float | None:
     """A constant L ≥ √ρ, rounded up, that these multipliers prove; None where they prove none up to ρ(1 + most).
 
@@ -46,7 +50,7 @@ def proved(
         narrow = len(weights) == 2 and len(weights[1]) == 1
         check = _narrow(weights[0], weights[1][0], multipliers[0], units) if narrow else _whole(weights, multipliers, units)
     rho = float(np.ldexp(rho, -2 * power))
-    slack = min(most, max(SLACK, check.least(rho)))
+    slack = min(most, max(THRESHOLDS.first_slack, check.least(rho)))
     while slack <= most:
         tried = float(np.nextafter(rho * (1 + slack), np.inf))
         if check(tried):

@@ -12,17 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.plugin import Array, Emit, Event, UsageError, silent
+from gapcert_networks.thresholds import THRESHOLDS
 
-from .bounds import APART
 from .network import Network
 from .network_cells import Cells
 from .network_patterns import by_patterns, open_gates
 
 CHUNK, DEEP = 256, 64  # boxes bounded together: one hidden layer, several
-POINTS, ROUNDS, TRIES = 1024, 12, 64  # where a large gradient is looked for first
-FEW, SOME, FIRST = 3, 5, 4096  # open gates per input: they are told apart at once; after so many boxes
-GATES, NODES = 40, 2000  # open gates and nodes over them: never more
-WHOLE = 4096  # up to so many open boxes are all split in a round, else the worse half
 
 
 @final
@@ -133,9 +129,10 @@ def _checked(
             f"input; leave out inputs that are constant"
         )
     s = np.ones(n) if units is None else np.array(units, dtype=np.float64)
-    if s.shape != (n,) or not (np.isfinite(s).all() and (s > 0).all()) or s.max() > APART * s.min():
+    if s.shape != (n,) or not (np.isfinite(s).all() and (s > 0).all()) or s.max() > THRESHOLDS.apart * s.min():
         raise UsageError(
-            f"network units: found {s.tolist()}; expected {n} positive numbers within {APART:g} of each other; one per input"
+            f"network units: found {s.tolist()}; expected {n} positive numbers within {THRESHOLDS.apart:g} of each "
+            "other; one per input"
         )
     return low, high, s
 
@@ -172,13 +169,13 @@ class _Search:
     def _looked(self, low: Array, high: Array) -> float:
         """A large gradient norm: of random points, then near the best of them."""
         rng = np.random.default_rng(0)
-        x = rng.uniform(low, high, (POINTS, len(low)))
+        x = rng.uniform(low, high, (THRESHOLDS.climb_points, len(low)))
         best, at = 0.0, (low / 2 + high / 2)
-        for i in range(ROUNDS):
+        for i in range(THRESHOLDS.climb_rounds):
             found = self.bounds.attained(x)
             if found.max() > best:
                 best, at = float(found.max()), x[found.argmax()]
-            x = np.clip(at + rng.normal(size=(TRIES, len(low))) * (high - low) * 0.5 ** (i / 2 + 3), low, high)
+            x = np.clip(at + rng.normal(size=(THRESHOLDS.climb_tries, len(low))) * (high - low) * 0.5 ** (i / 2 + 3), low, high)
         return best
 
     @property
@@ -188,9 +185,9 @@ class _Search:
     def run(self, budget: int, end: float, emit: Emit) -> tuple[float, float, int]:
         self._close()
         gates = open_gates(self.bounds, self.low, self.high) if len(self.upper) else None
-        tried = gates is None or gates > GATES
+        tried = gates is None or gates > THRESHOLDS.most_gates
         share = (gates or 0) / self.bounds.n
-        first = 0 if share <= FEW else FIRST if share <= SOME else math.inf
+        first = 0 if share <= THRESHOLDS.few_gates else THRESHOLDS.gate_boxes if share <= THRESHOLDS.some_gates else math.inf
         whole = self.low, self.high
         while len(self.upper):
             if self.count + 2 > budget or time.monotonic() > end:
@@ -214,7 +211,7 @@ class _Search:
 
     def _by_gates(self, box: tuple[Array, Array], budget: int, end: float, emit: Emit) -> None:
         """Few gates tell them apart sooner than boxes do, if the inputs are many."""
-        before, known, most = self.count, self.value, min(NODES, budget - self.count)
+        before, known, most = self.count, self.value, min(THRESHOLDS.gate_nodes, budget - self.count)
 
         def tell(value: float, lower: float, nodes: int, open_: int) -> bool:
             self.count = before + nodes
@@ -233,7 +230,7 @@ class _Search:
     def _split(self, budget: int, end: float) -> None:
         """The open boxes, or the worse half of many, become two each, chunk by chunk."""
         chosen = np.ones(len(self.upper), dtype=bool)
-        if len(chosen) > WHOLE:
+        if len(chosen) > THRESHOLDS.split_boxes:
             chosen = self.upper >= np.median(self.upper)
         size = (CHUNK if self.bounds.depth == 1 else DEEP) // 2
         rows = np.flatnonzero(chosen)[: max((budget - self.count) // 2, 1)]

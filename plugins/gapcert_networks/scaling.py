@@ -9,12 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.plugin import Array, UsageError
+from gapcert_networks.thresholds import THRESHOLDS
 
 from .network_constant import proved, rescaled
 
 Integers = npt.NDArray[np.int64]
-
-SWEEPS = 10
 
 
 def proved_balanced(weights: Sequence[Array], multipliers: Sequence[Array], square: float, exponent: int = 0) -> float | None:
@@ -59,7 +58,7 @@ def balanced(weights: Sequence[Array], units: Array) -> tuple[list[Array], Array
     weights = [_exact(weights[0], np.zeros(len(weights[0]), dtype=np.int64), -inputs, "weights[0]"), *weights[1:]]
     sizes = [_exponents(w) for w in weights]
     c = [np.zeros(weights[0].shape[1]), *(np.zeros(len(w)) for w in weights)]
-    for _ in range(SWEEPS if len(weights) > 2 else 1):  # of one hidden layer the first is the last
+    for _ in range(THRESHOLDS.scaling_sweeps if len(weights) > 2 else 1):  # of one hidden layer the first is the last
         for i in range(1, len(weights)):
             c[i] = ((sizes[i] + c[i + 1][:, None]).max(axis=0) - _into(sizes[i - 1], c[i - 1])) / 2
     mean = float(np.mean([(_into(z, c[i]) + c[i + 1]).max() for i, z in enumerate(sizes)]))

@@ -12,12 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array
+from gapcert_neural.thresholds import THRESHOLDS
 
 from .training import Layers, Plan, Progress, Training
 
 Index = npt.NDArray[np.intp]
-
-_CELLS, _POINTS = 128, 16  # of a batch: cells, and points of each
 
 
 @final
@@ -41,9 +40,11 @@ class Pool:
 
     def batch(self, rng: np.random.Generator) -> Index:
         """(cells, points): numbers of points, drawn with replacement within cells drawn without."""
-        cells = rng.permutation(len(self.starts) - 1)[:_CELLS]
+        cells = rng.permutation(len(self.starts) - 1)[: THRESHOLDS.batch_cells]
         count = np.diff(self.starts)[cells]
-        return np.asarray(self.starts[cells][:, None] + (rng.random((len(cells), _POINTS)) * count[:, None]).astype(np.intp))
+        return np.asarray(
+            self.starts[cells][:, None] + (rng.random((len(cells), THRESHOLDS.batch_points)) * count[:, None]).astype(np.intp)
+        )
 
 
 @final

@@ -11,13 +11,9 @@ from typing import Any, final
 import numpy as np
 
 from gapcert import Array, UsageError
+from gapcert_neural.thresholds import THRESHOLDS
 
 from .training import Layers, Plan, Progress, Training
-
-_BATCH, _SCORED = 4096, 100_000
-_TURNS = 2  # of the fixed point for X, in each step
-_PHASES = 8  # of the published recipe, one for each value of η
-_FEASIBLE = 0.02  # of the largest |r|: what may be missing at the end of a phase
 
 
 @final
@@ -56,7 +52,7 @@ class CoverTraining(Training):
         self.z, self.t, self.active = (self.tensor(a) for a in (points.z, points.t, points.active))
         # Slopes per unit of z as measured: what the cover's radius multiplies.
         self.inverse = self.tensor(1 / points.half)
-        self.scored = np.linspace(0, len(points.z) - 1, min(_SCORED, len(points.z))).astype(np.intp)
+        self.scored = np.linspace(0, len(points.z) - 1, min(THRESHOLDS.scored_points, len(points.z))).astype(np.intp)
 
     def data(self) -> Sequence[Array]:
         p = self.points
@@ -75,13 +71,13 @@ class CoverTraining(Training):
         return self.torch.relu((hidden * w).sum(dim=2) + c)
 
     def batch(self) -> Any:
-        rows = self.draws.integers(0, len(self.points.z), min(_BATCH, len(self.points.z)))
+        rows = self.draws.integers(0, len(self.points.z), min(THRESHOLDS.cover_batch, len(self.points.z)))
         return self.torch.as_tensor(rows, device=self.z.device)
 
     def shortfall(self, theta: Any) -> tuple[Array, Array]:
         """(t − q, q) at the points that are looked at, (n, nx)."""
         found = []
-        for rows in np.array_split(self.scored, max(1, len(self.scored) // _BATCH)):
+        for rows in np.array_split(self.scored, max(1, len(self.scored) // THRESHOLDS.cover_batch)):
             at = self.torch.as_tensor(rows, device=self.z.device)
             q = self.value(theta, self.z[at])
             found.append(np.stack([(self.t[at] - q).cpu().numpy(), q.cpu().numpy()]))
@@ -110,7 +106,7 @@ class PaidTraining(CoverTraining):
         rows, sharpness = self.batch(), 10.0 + 90.0 * done
         q = self.value(theta, self.z[rows])
         short = (sharpness * (self.t[rows] - q)).logsumexp(dim=0) / sharpness
-        return (q.mean(dim=0) + short + self.points.radius * self.constants(theta, _TURNS)).sum()
+        return (q.mean(dim=0) + short + self.points.radius * self.constants(theta, THRESHOLDS.constant_turns)).sum()
 
     def score(self, theta: Any) -> float:
         short, q = self.shortfall(theta)
@@ -224,8 +220,8 @@ class PaperTraining(CoverTraining):
     def score(self, theta: Any) -> float:
         """The newest θ stands. Where a phase ends, the half of [least, most] that cannot hold η is cut off."""
         short, _ = self.shortfall(theta)
-        if self.step % max(1, self.plan.steps // _PHASES) == 0:
-            feasible = short.max(axis=0) <= _FEASIBLE * self.top
+        if self.step % max(1, self.plan.steps // THRESHOLDS.recipe_phases) == 0:
+            feasible = short.max(axis=0) <= THRESHOLDS.phase_shortfall * self.top
             low, high, eta = self.extra
             ends = np.where(feasible, low, eta), np.where(feasible, eta, high)
             self.extra = np.stack([*ends, (ends[0] + ends[1]) / 2])

@@ -13,14 +13,12 @@ from gapcert import Array, GapFunction, UsageError
 from gapcert.plugin import GapFamily, GapProblem, Pulse
 from gapcert_functions import Table, band, dominate
 from gapcert_networks import Network, raised
+from gapcert_neural.thresholds import THRESHOLDS
 
 from .banded import BandTraining, Pool
 from .covered import CertifiedTraining, Covered, CoverTraining, PaperTraining
 from .shapes import SHAPES
 from .training import Plan, Progress
-
-_PER_CELL, _MOST = 16, 65_536  # points that the band is asked at
-_TABLE = 4096  # cells of the default table
 
 
 @final
@@ -76,7 +74,7 @@ class Neural(GapFamily):
 
     def _banded(self, problem: GapProblem, plan: Plan) -> GapFunction:
         nz, nx = len(problem.domain.low), problem.domain.nx
-        counts = tuple(self.cells or (max(1, min(8, int(_TABLE ** (1 / nz) + 1e-9))),) * nz)
+        counts = tuple(self.cells or (max(1, min(8, int(THRESHOLDS.table_cells ** (1 / nz) + 1e-9))),) * nz)
         units, pool = self._pool(problem, counts)
         layers = units.restored(BandTraining(plan, pool, *_followed(problem)).run())
         upper = self._network(layers, slice(-nx, None))
@@ -121,7 +119,7 @@ class Neural(GapFamily):
     def _pool(self, problem: GapProblem, counts: Sequence[int]) -> tuple[_Units, Pool]:
         domain, nx = problem.domain, problem.domain.nx
         table = Table.uniform(domain.low.tolist(), domain.high.tolist(), counts)
-        n = int(np.clip(_PER_CELL * len(table), 4096, _MOST))
+        n = int(np.clip(THRESHOLDS.asked_per_cell * len(table), 4096, THRESHOLDS.asked_points))
         z = domain.draw(n, np.random.default_rng([problem.seed, 0x9001]))
         low, high = band(problem).interval(z)
         p = problem.predictor(z)

@@ -18,16 +18,11 @@ import numpy as np
 
 import gapcert
 from gapcert import Array, UsageError
+from gapcert_neural.thresholds import THRESHOLDS
 
 Layers = list[tuple[Array, Array]]
 Progress = Callable[[int, int, float], None]
 """Told the steps done, of how many, and the best loss so far."""
-
-_EVERY = 5.0  # seconds between checkpoints
-_LOOKS = 20  # at the loss of all points, in the course of a training
-_HALVINGS = 12  # of a step that is not accepted
-_PATIENCE = 5  # looks without a gain of a thousandth
-_ENOUGH = 1e-3  # loss, in units of the targets' spread, that is not worth reducing
 
 
 @final
@@ -99,14 +94,14 @@ class Training(ABC):
         self._resume()
         theta, m, v = (self.tensor(row) for row in self.state[:3])
         theta.requires_grad_(True)
-        look, saved = max(1, self.plan.steps // _LOOKS), time.monotonic()
+        look, saved = max(1, self.plan.steps // THRESHOLDS.training_looks), time.monotonic()
         try:
             while self.step < self.plan.steps and self.stale < self.patience:
                 self._advance(theta, m, v)
                 if self.step % look == 0 or self.step == self.plan.steps:
                     self._look(theta)
                 self.progress(self.step, self.plan.steps, self.best)
-                if time.monotonic() - saved > _EVERY:
+                if time.monotonic() - saved > THRESHOLDS.checkpoint_seconds:
                     self._save(theta, m, v)
                     saved = time.monotonic()
         except KeyboardInterrupt:
@@ -122,7 +117,7 @@ class Training(ABC):
     @property
     def patience(self) -> int:
         """Looks without a gain after which it ends."""
-        return _PATIENCE
+        return THRESHOLDS.patience
 
     def accepted(self, theta: Any) -> bool:
         """May θ be where a step has led it?"""
@@ -172,7 +167,7 @@ class Training(ABC):
             rate = self.plan.rate * (0.5 + 0.5 * np.cos(np.pi * done)) / (1 - 0.9**self.step)
             before = theta.clone()
             theta.sub_(m / ((v / (1 - 0.999**self.step)).sqrt() + 1e-8), alpha=rate)
-            for _ in range(_HALVINGS):
+            for _ in range(THRESHOLDS.step_halvings):
                 if self.accepted(theta):
                     return
                 theta.copy_((theta + before) / 2)
@@ -181,7 +176,7 @@ class Training(ABC):
     def _look(self, theta: Any) -> None:
         with self.torch.no_grad():
             loss = self.score(theta)
-        self.stale = 0 if loss < self.best * (1 - 1e-3) and self.best > _ENOUGH else self.stale + 1
+        self.stale = 0 if loss < self.best * (1 - 1e-3) and self.best > THRESHOLDS.small_loss else self.stale + 1
         if loss < self.best:
             self.best, self.state[3] = loss, theta.detach().cpu().numpy()
 

@@ -30,7 +30,7 @@ JOINTS_AT_MOST = 120
 
 __all__ = ["JOINTS_AT_MOST", "Client", "pybullet"]
 
-_STRONG = 1e9
+_STRONG = 1e9  # N or N·m: no limit
 _CONTACT = {"rolling_friction": "rollingFriction", "spinning_friction": "spinningFriction", "restitution": "restitution"}
 """What PyBullet calls the parameters of contacts."""
 _TYPES = {

@@ -13,7 +13,7 @@ from gapcert_engines import Link, as_section
 from .client import Client, pybullet
 from .rotation import inverse, product, rotated
 
-_UNIT = 1e-10
+_UNIT = 1e-10  # between an axis that was written in decimals and a unit vector; chosen, not measured
 
 
 def section(client: Client, coordinates: Sequence[str], stated: Mapping[str, float], free: Mapping[str, str]) -> dict[str, Any]:

@@ -11,11 +11,11 @@ import h5py
 import numpy as np
 
 import gapcert as gc
+from gapcert_readers.thresholds import THRESHOLDS
 
 from .files import Columns, FileReader, broken, spread, told
 
 FORM = "an HDF5 file"
-HUGE, PACKED = 1 << 28, 1100  # bytes that are always read, and how many times smaller the best compression makes the others
 
 
 @final
@@ -93,7 +93,7 @@ def _own(item: Any, name: str) -> None:
         raise gc.UsageError(
             f"recording: '{name}' has its values in another file; expected a file that holds them; copy it whole"
         )
-    if item.nbytes > HUGE and item.nbytes > PACKED * item.id.get_storage_size():
+    if item.nbytes > THRESHOLDS.always_read and item.nbytes > THRESHOLDS.packed_times * item.id.get_storage_size():
         what = f"'{name}' states {item.nbytes:,} bytes, of which the file holds {item.id.get_storage_size():,}"
         raise gc.UsageError(f"recording: {what}; expected data that are there")
 

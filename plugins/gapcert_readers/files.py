@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 import gapcert as gc
+from gapcert_readers.thresholds import THRESHOLDS
 
 from .config import Log, Table
 
 Columns = Mapping[str, Any]
 TIME = "(time)"
-MOST = 64  # columns of one array that get a name each
 
 
 class FileReader(gc.plugin.Reader):
@@ -95,7 +95,7 @@ def spread(name: str, values: Any, labels: Sequence[str] = ()) -> Iterable[tuple
     array = np.asarray(values)
     if array.ndim == 1:
         yield name, array
-    elif array.ndim == 2 and array.shape[1] <= MOST:
+    elif array.ndim == 2 and array.shape[1] <= THRESHOLDS.named_columns:
         for i in range(array.shape[1]):
             yield f"{name}[{i}]", array[:, i]
         if len(labels) == array.shape[1]:

@@ -14,13 +14,13 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import gapcert as gc
 from gapcert import Array
+from gapcert_readers.thresholds import THRESHOLDS
 
 from .files import TIME, Columns, FileReader, told
 
 Message = tuple[str, int, Any]  # topic, time of logging in ns, content
 _STEP = re.compile(r"\.?([^.\[\]]+)|\[([^\]]+)\]")
 NAMES = ("name", "names", "joint_names")  # the list beside an array that names its elements
-MOST = 64  # elements of an array that are listed
 
 
 class MessageReader(FileReader):
@@ -134,7 +134,7 @@ def _leaves(content: Any, path: str) -> Iterator[str]:
     if isinstance(content, bool | int | float | np.number):
         yield path
     elif isinstance(content, list | tuple | np.ndarray):
-        for i, part in enumerate(content[:MOST]):
+        for i, part in enumerate(content[: THRESHOLDS.listed_elements]):
             yield from _leaves(part, f"{path}[{i}]")
     else:
         parts = content if isinstance(content, Mapping) else getattr(content, "__dict__", {})

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import gapcert as gc
+from gapcert_readers.thresholds import THRESHOLDS
 
 MARKS = ",;\t "
-MOST = 1000  # lines that a logger says something in
 LARGEST = 2**31 - 1  # bytes of a block: what decides on the type of a column
 _COMMA = r"^\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*$"
 _GROUPED = r"^\s*[+-]?[1-9]\d{0,2}(,\d{3})+\s*$"
@@ -92,7 +92,7 @@ def line_of(path: Path, row: int) -> int:
 def remarks(path: Path) -> int:
     """How many lines that begin with # or % stand above the header, which is the first without, and holds names."""
     with open(path, encoding="utf-8-sig", errors="replace") as file:
-        for n, line in enumerate(itertools.islice(_bounded(file), MOST)):
+        for n, line in enumerate(itertools.islice(_bounded(file), THRESHOLDS.preamble_lines)):
             if line.strip() and not line.lstrip().startswith(("#", "%")):
                 # Where numbers follow, the last remark is the header.
                 return 0 if re.match(r"\s*[-+.\d]", line) else n

@@ -7,9 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 
 from gapcert.plugin import SHORTEST, Array, Recording, Relation, System, Trajectory, UsageError, Zone, step_seed
-
-TRIES = 256  # inputs drawn at a time for one that keeps the relations
-HOLD = (0.2, 1.0)  # s
+from gapcert_recordings.thresholds import THRESHOLDS
 
 
 def play(
@@ -18,7 +16,7 @@ def play(
     *,
     seconds: float = 10.0,
     trajectories: int = 8,
-    hold: tuple[float, float] = HOLD,
+    hold: tuple[float, float] = THRESHOLDS.hold_seconds,
     pause: float = 0.0,
     relations: Sequence[Relation] = (),
     channels: Collection[str] | None = None,
@@ -28,9 +26,9 @@ def play(
 
     ranges: of every input, and of states where a trajectory starts (a state without one starts at 0; [a, a] is a point);
     hidden state starts at its default. Motion may leave the ranges. pause: s of zero input after every drawn one, so that a
-    system that brakes by itself starts each from rest. relations: over (x, u), kept by every drawn input while one of TRIES
-    does. channels: the states that are recorded (default: all that are numbers). The noise of a state is the system's
-    rounding; of a system with a `seed` it is left to be estimated. A pure function of its arguments.
+    system that brakes by itself starts each from rest. relations: over (x, u), kept by every drawn input while one of
+    `input_tries` does. channels: the states that are recorded (default: all that are numbers). The noise of a state is the
+    system's rounding; of a system with a `seed` it is left to be estimated. A pure function of its arguments.
     """
     _check(system, ranges, seconds, hold)
     rng, count = np.random.default_rng(seed), round(seconds / system.period)
@@ -82,7 +80,7 @@ def _bounds(names: Sequence[str], ranges: Mapping[str, tuple[float, float]]) -> 
 
 def _drawn(zone: Zone, x: Array, before: Array, low: Array, high: Array, rng: np.random.Generator) -> Array:
     """A new input at x; the one before, where the relations leave none that was found."""
-    found = low + (high - low) * rng.random((TRIES if zone.relations else 1, len(low)))
+    found = low + (high - low) * rng.random((THRESHOLDS.input_tries if zone.relations else 1, len(low)))
     if not zone.relations:
         return np.asarray(found[0])
     good = zone.related(np.hstack([np.tile(x, (len(found), 1)), found]))

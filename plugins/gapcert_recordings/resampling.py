@@ -12,20 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.plugin import SHORTEST, Array, Bools, Hold, StateSpec, Trajectory, UsageError
+from gapcert_recordings.thresholds import THRESHOLDS
 
 from .smoothing import absurd, filled_in, noise_floor, smoothed
 from .unwrapping import counted
 
 Rows = npt.NDArray[np.intp]
 JITTER = 1e-3  # of the sampling period: below that, samples are evenly spaced
-BRIDGE = 5  # lost samples over which an input may be continued
-STRAY = 3  # samples in a row that may arrive out of order; more are a clock that was set back
-RESETS = 20
-HUGE = 1e30  # in whatever unit: no measurement, but what formats fill holes with, such as 9.97e36 or the largest float
-FAR = 10.0  # times the range of all else: where one value is found again and again, it stands for no measurement
-JUMP = 4.0  # times its usual change: an input that moved so far while it was not seen cannot be continued
-UNSEEN = 0.05  # of the noise floor: what uneven times change by less may be taken for even
-ARRIVAL = -0.05  # log of the noise floor with even times over that with the logged ones: below, these are times of arrival
 
 
 @final
@@ -156,7 +149,7 @@ def _clock(tr: Trajectory, log: Log) -> tuple[Rows, list[int]]:
         late = np.concatenate([[False], t[1:] <= np.maximum.accumulate(t)[:-1]])
         edges = np.flatnonzero(np.diff(np.concatenate([[False], late, [False]])))
         runs = edges.reshape(-1, 2)
-        back = runs[runs[:, 1] - runs[:, 0] > STRAY, 0]
+        back = runs[runs[:, 1] - runs[:, 0] > THRESHOLDS.stray_samples, 0]
         stop = int(back[0]) if len(back) else len(t)
         stray = start + np.flatnonzero(late[:stop])
         kept = np.delete(kept, stray)
@@ -165,9 +158,10 @@ def _clock(tr: Trajectory, log: Log) -> tuple[Rows, list[int]]:
         start += stop - len(stray)
         cuts.append(start)
         log.resets.append({"trajectory": tr.name, "at": float(t[stop - 1]), "to": float(t[stop])})
-        if len(cuts) > RESETS:
+        if len(cuts) > THRESHOLDS.clock_resets:
             raise UsageError(
-                f"recording: trajectory '{tr.name}': time is set back more than {RESETS} times; expected a clock; name the "
+                f"recording: trajectory '{tr.name}': time is set back more than {THRESHOLDS.clock_resets} times; "
+                "expected a clock; name the "
                 "column of times as `time`, or the column that tells trajectories apart as `trajectory`"
             )
     log.duplicates += len(tr.t) - len(kept)
@@ -175,17 +169,18 @@ def _clock(tr: Trajectory, log: Log) -> tuple[Rows, list[int]]:
 
 
 def readings(values: Array, fills: bool = True) -> Array:
-    """A column (T,) with NaN for what is no measurement: beyond HUGE, or what loggers fill holes with, such as -9999.
+    """A column (T,) with NaN for what is no measurement: beyond `no_measurement`, or what loggers fill holes with, such as
+    -9999.
 
-    Such a fill is one value other than zero, found more than once, further from all others than FAR times their range. What
-    moves cannot come back to exactly the same place out there; at zero it can rest, an input anywhere: it is asked without
-    `fills`.
+    Such a fill is one value other than zero, found more than once, further from all others than `fill_distance` times their
+    range. What moves cannot come back to exactly the same place out there; at zero it can rest, an input anywhere: it is asked
+    without `fills`.
     """
-    out = np.where(np.abs(values) <= HUGE, values, np.nan)
+    out = np.where(np.abs(values) <= THRESHOLDS.no_measurement, values, np.nan)
     known = out[np.isfinite(out)]
     for end in (known.min(), known.max()) if fills and len(known) else ():
         rest = known[known != end]
-        alone = len(rest) >= SHORTEST and np.abs(rest - end).min() > FAR * np.ptp(rest) > 0
+        alone = len(rest) >= SHORTEST and np.abs(rest - end).min() > THRESHOLDS.fill_distance * np.ptp(rest) > 0
         if alone and end != 0 and np.sum(known == end) > 1:
             out[out == end] = np.nan
     return out
@@ -234,10 +229,10 @@ def _gaps(name: str, t: Array, u: Array, dt: float, log: Log) -> list[int]:
     usual = [np.quantile(np.abs(np.diff(u[rows, j])), 0.9) for j in range(u.shape[1])]
     for k in np.flatnonzero(lost > 0).tolist():
         a, b = int(rows[k]), int(rows[k + 1])
-        moved = any(abs(u[b, j] - u[a, j]) > JUMP * usual[j] * (lost[k] + 1) for j in range(u.shape[1]))
-        if lost[k] > BRIDGE or moved:
+        moved = any(abs(u[b, j] - u[a, j]) > THRESHOLDS.input_jump * usual[j] * (lost[k] + 1) for j in range(u.shape[1]))
+        if lost[k] > THRESHOLDS.bridged_samples or moved:
             cuts += [a + 1, b]
-            kind = log.gaps if lost[k] > BRIDGE else log.cuts
+            kind = log.gaps if lost[k] > THRESHOLDS.bridged_samples else log.cuts
             kind.append({"trajectory": name, "at": float(t[a]), "seconds": float(ahead[k])})
         else:
             log.dropped += int(lost[k]) - (b - a - 1)
@@ -308,13 +303,16 @@ def _smooth(
     if offset.any():
         even = [noise_floor(filled_in(y[:, j], valid[:, j]), valid[:, j]) for j in range(len(names))]
         # A signal that is smoother over an even grid than over the times it came with was sampled evenly.
-        if np.nanmean([np.log(max(e, 1e-300) / max(c.noise, 1e-300)) for e, c in zip(even, curves, strict=True)]) < ARRIVAL:
+        if (
+            np.nanmean([np.log(max(e, 1e-300) / max(c.noise, 1e-300)) for e, c in zip(even, curves, strict=True)])
+            < THRESHOLDS.arrival_gain
+        ):
             log.stamps, offset = "ignored", np.zeros_like(offset)
             curves = [smoothed(y[:, j], valid[:, j], offset, dt) for j in range(len(names))]
     smooth, slope = (np.stack([getattr(c, n) for c in curves], axis=-1) for n in ("value", "slope"))
     filled = np.where(valid, y, smooth)
     noise = np.array([c.noise for c in curves])
-    if (np.sqrt(np.mean((slope * offset[:, None]) ** 2, axis=0)) < UNSEEN * noise).all():
+    if (np.sqrt(np.mean((slope * offset[:, None]) ** 2, axis=0)) < THRESHOLDS.unseen_jitter * noise).all():
         offset = np.zeros_like(offset)
     return Piece(t, filled, valid.astype(np.float64), offset, smooth, slope, knots, u, noise)
 

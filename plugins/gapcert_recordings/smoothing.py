@@ -12,14 +12,9 @@ from scipy.ndimage import maximum_filter1d, median_filter
 from scipy.signal import savgol_coeffs, savgol_filter
 
 from gapcert.plugin import Array, Bools
+from gapcert_recordings.thresholds import THRESHOLDS
 
-WIDEST = 0.1  # s on either side of a sample that a smooth curve may look at
-ABSURD, ONE_SIDED = 8.0, 3.0  # times the local scatter: both sides together, and each alone
-ROUNDS = 20
-LEAST_ABSURD = 0.005  # of the channel's spread: kinks of a clean signal are no outliers
-AROUND, BLOCK = 4, 50  # samples of the cubic on either side; samples that share a scatter
-ALLOWED = 0.05  # of the noise: bias of a smooth curve
-SHORT = 16  # samples that a scatter needs
+AROUND = 4  # samples of the cubic on either side
 
 
 def noise_floor(y: Array, valid: Bools | None = None) -> float:
@@ -53,12 +48,12 @@ def absurd(y: Array, valid: Bools) -> Bools:
     out first, so that its neighbours are not judged by it.
     """
     found = np.zeros(len(y), dtype=bool)
-    if len(y) < BLOCK or valid.sum() < SHORT:
+    if len(y) < THRESHOLDS.scatter_samples or valid.sum() < THRESHOLDS.least_scatter:
         return found
     low, high = np.quantile(y[valid], [0.1, 0.9])
-    for _ in range(ROUNDS):
+    for _ in range(THRESHOLDS.outlier_rounds):
         left = valid & ~found
-        size = _strangeness(filled_in(y, left), left, LEAST_ABSURD * float(high - low))
+        size = _strangeness(filled_in(y, left), left, THRESHOLDS.least_outlier * float(high - low))
         worst = left & (size > 0) & (size >= maximum_filter1d(size, 2 * AROUND + 1, mode="nearest"))
         if not worst.any():
             break
@@ -69,12 +64,12 @@ def absurd(y: Array, valid: Bools) -> Bools:
 def _strangeness(y: Array, valid: Bools, least: float) -> Array:
     """The distance (T,) of each sample from a cubic through its neighbours; 0 for those that pass one of the tests."""
     at_cubic = _left(y, _BOTH)
-    scatter = np.maximum(ABSURD * _scatter(at_cubic, valid) / _amplified(_BOTH), least)
+    scatter = np.maximum(THRESHOLDS.outlier_scatter * _scatter(at_cubic, valid) / _amplified(_BOTH), least)
     strange = np.abs(at_cubic) > scatter
     if strange.any():
         strange &= np.abs(y - median_filter(y, 5, mode="nearest")) > scatter
         for side in (_left(y, _BEFORE), _left(y, _BEFORE[::-1])):
-            strange &= np.abs(side) > np.maximum(ONE_SIDED * _scatter(side, valid), least)
+            strange &= np.abs(side) > np.maximum(THRESHOLDS.one_sided_scatter * _scatter(side, valid), least)
     return np.asarray(np.where(strange, np.abs(at_cubic), 0.0))
 
 
@@ -101,13 +96,13 @@ _BEFORE = _predictor(np.arange(-AROUND, 0), 2)
 
 def _scatter(r: Array, valid: Bools) -> Array:
     """1.4826 times the median of |r| (T,) in the block around each sample, the largest of three neighbouring blocks."""
-    count = -(-len(r) // BLOCK)
-    blocks = np.full(count * BLOCK, np.inf)
+    count = -(-len(r) // THRESHOLDS.scatter_samples)
+    blocks = np.full(count * THRESHOLDS.scatter_samples, np.inf)
     blocks[: len(r)] = np.where(valid, np.abs(r), np.inf)
-    blocks = np.sort(blocks.reshape(count, BLOCK), axis=1)
+    blocks = np.sort(blocks.reshape(count, THRESHOLDS.scatter_samples), axis=1)
     there = np.isfinite(blocks).sum(axis=1)
     medians = np.where(there > 0, blocks[np.arange(count), np.maximum(there - 1, 0) // 2], 0.0)
-    return np.asarray(1.4826 * np.repeat(maximum_filter1d(medians, 3, mode="nearest"), BLOCK)[: len(r)])
+    return np.asarray(1.4826 * np.repeat(maximum_filter1d(medians, 3, mode="nearest"), THRESHOLDS.scatter_samples)[: len(r)])
 
 
 def filled_in(y: Array, valid: Bools) -> Array:
@@ -146,10 +141,10 @@ def smoothed(y: Array, valid: Bools, offset: Array, period: float) -> Curve:
 
 def _filter(y: Array, valid: Bools, period: float) -> tuple[int, int]:
     """(width, degree)."""
-    reach = min(max(2, round(WIDEST / period)), (len(y) - 1) // 2)
+    reach = min(max(2, round(THRESHOLDS.widest_smooth / period)), (len(y) - 1) // 2)
     widest = min(5, len(y) - 1 + len(y) % 2)
     best, least = (widest, min(3, widest - 1)), math.inf
-    most = 1 + ALLOWED + 1.5 / math.sqrt(len(y))  # sums of squares scatter by sqrt(2/n)
+    most = 1 + THRESHOLDS.smooth_bias + 1.5 / math.sqrt(len(y))  # sums of squares scatter by sqrt(2/n)
     for degree, half in _filters(reach):
         width = 2 * half + 1
         left = _middle((y - savgol_filter(y, width, degree)) ** 2, valid, half)

@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.plugin import Array, Model, Recording, Trajectory, UsageError
-
-TIMING = 1e-3  # of the period: how far two rows may be from one period apart
+from gapcert_recordings.thresholds import THRESHOLDS
 
 
 @final
@@ -67,8 +66,8 @@ class Transitions:
         for i in np.unique(of):
             own = np.flatnonzero(of == i)
             own = own[np.argsort(t[own], kind="stable")]
-            m = np.minimum(np.searchsorted(t[own], t[own] + period * (1 - TIMING)), len(own) - 1)
-            good = np.abs(t[own[m]] - t[own] - period) <= TIMING * period
+            m = np.minimum(np.searchsorted(t[own], t[own] + period * (1 - THRESHOLDS.period_error)), len(own) - 1)
+            good = np.abs(t[own[m]] - t[own] - period) <= THRESHOLDS.period_error * period
             found.append((own[good], own[m[good]]))
         none = np.zeros(0, dtype=np.intp)
         return np.concatenate([none, *(k for k, _ in found)]), np.concatenate([none, *(m for _, m in found)])
@@ -85,7 +84,7 @@ def _steps(piece: tuple[Array, Mapping[str, Array]], names: Sequence[str], model
     """(t, x, u, x⁺) of every row with another one period later."""
     t, channels = piece
     z = np.stack([channels[n] for n in names], axis=1)
-    nx, slack = model.nx, TIMING * model.period
+    nx, slack = model.nx, THRESHOLDS.period_error * model.period
     end = np.searchsorted(t, t + model.period - slack)
     k = np.flatnonzero(end < len(t))
     m = end[k]

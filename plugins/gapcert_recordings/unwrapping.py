@@ -8,11 +8,10 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.plugin import Array
+from gapcert_recordings.thresholds import THRESHOLDS
 
 Rows = npt.NDArray[np.intp]
 TURN = 2 * np.pi
-APART = 1.5  # of the period: steps of time that are longer are holes
-ENDS = 5  # samples on either side of a hole that tell how fast it turns there
 
 
 def counted(values: Array, t: Array, dt: float, rate: Array | None = None) -> Array:
@@ -24,7 +23,7 @@ def counted(values: Array, t: Array, dt: float, rate: Array | None = None) -> Ar
     rows = np.flatnonzero(np.isfinite(values))
     if len(rows) < 2:
         return values
-    holes = 1 + np.flatnonzero((np.diff(rows) > 1) | (np.diff(t[rows]) > APART * dt))
+    holes = 1 + np.flatnonzero((np.diff(rows) > 1) | (np.diff(t[rows]) > THRESHOLDS.hole_step * dt))
     runs = [rows[a:b] for a, b in itertools.pairwise([0, *holes.tolist(), len(rows)])]
     out = values.copy()
     for run in runs:
@@ -46,7 +45,7 @@ def _moved(angle: Array, t: Array, dt: float, before: Rows, after: Rows, rate: A
         known = np.flatnonzero(np.isfinite(rate))
         at = np.arange(a, b + 1)
         return float(np.trapezoid(np.interp(at, known, rate[known]), t[at])) if len(known) else 0.0
-    ends = [run for run in (before[-ENDS:], after[:ENDS]) if len(run) > 1]
+    ends = [run for run in (before[-THRESHOLDS.hole_ends :], after[: THRESHOLDS.hole_ends]) if len(run) > 1]
     if not turns or not ends:
         return 0.0
     return float(t[b] - t[a]) * float(np.mean([(angle[e[-1]] - angle[e[0]]) / (t[e[-1]] - t[e[0]]) for e in ends]))

@@ -13,13 +13,14 @@ import numpy as np
 from gapcert import Array, Box, Domain, GapFunction, Goal, Model, Region, SynthesisProblem, UsageError
 from gapcert.plugin import Bools, Ints, Policy, Pulse, Synthesizer, magnitude
 from gapcert_cells import AutomatonController, GridController, Successors
+from gapcert_symbolic.thresholds import THRESHOLDS
 
 from .cells.abstraction import Windows, check_size, windows
 from .cells.bounds import Bound, Enclosed, Grown
 from .cells.gaps import Disturbance, disturbance
 from .cells.grid import Grid, corners, multiples, spaced
 from .cells.held import Left, invariant, offered
-from .cells.structure import PAIRS, inferred
+from .cells.structure import inferred
 from .games.automata import Labels, product, started, unlabelled
 from .games.change import in_words, tried
 from .games.games import inside, over, reach_and_stay, recurrence, touching
@@ -33,7 +34,8 @@ from .solvers.solvers import solve, usable
 CHUNK = 1 << 20
 TRUSTED = "The successors of cells are bounded by the growth bound that is declared, in floating point; nothing proves it."
 SEEN = (
-    f"On which states and inputs the model's successors depend was inferred from {PAIRS} random pairs of points per axis, as "
+    f"On which states and inputs the model's successors depend was inferred from {THRESHOLDS.structure_pairs} random "
+    "pairs of points per axis, as "
     f"the model encloses no derivatives; a dependence that none of them shows is missed."
 )
 

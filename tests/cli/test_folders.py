@@ -168,7 +168,7 @@ def test_a_torn_last_line_is_left_out_and_numbers_go_on(tmp_path):
 
 
 def test_a_journal_is_bounded_and_a_follower_sees_each_line_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(journal, "PAUSE", 0.0)
+    monkeypatch.setattr(journal, "THRESHOLDS", replace(journal.THRESHOLDS, stage_pause=0.0))
     monkeypatch.setattr(journal, "LIMIT", 20_000)
     follower, seen = Follower(tmp_path), []
     with Journal(tmp_path) as j:

@@ -13,6 +13,7 @@ from gapcert_diagnosis.fitting import fit as fitting
 from gapcert_diagnosis.fitting.fit import Hypothesis, carried, fit, followed, stepped
 from gapcert_diagnosis.fitting.hypothesis import between
 from gapcert_diagnosis.testing import ROD, equations
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
 SIGMA, T = 1e-3, 1000
 DRY = Extension("dry", "q", (Parameter("fc", 0.0, "N*m"),), dry_friction="fc")
@@ -161,7 +162,7 @@ def test_a_bristle_is_bent_by_the_fitted_motion_and_not_by_noise(monkeypatch):
     assert reached.tolist() == [False, *[True] * (len(windows) - 1)]
     assert off[1].max() < 1e-3 < 0.02 < min(off[0][0].max(), off[0][1:].max())
     fitted = [fit(h, windows)]
-    monkeypatch.setattr("gapcert_diagnosis.fitting.fit.RETRACED", 0)
+    monkeypatch.setattr("gapcert_diagnosis.fitting.fit.THRESHOLDS", replace(THRESHOLDS, retraced_memories=0))
     fitted.append(fit(h, windows))
     near, far = (np.mean((f.start - motion[:, 0]) ** 2) for f in fitted)
     assert near < far
@@ -218,7 +219,7 @@ def test_where_a_law_is_plainly_missing_no_last_hundredth_is_searched_for(monkey
     squares, made, plain = [], [], fitting._linearise
     monkeypatch.setattr(fitting, "_linearise", lambda *given: made.append(len(squares)) or plain(*given))
     for rough in (1e-4, 0.0):
-        monkeypatch.setattr(fitting, "LEFT_ROUGH", rough)
+        monkeypatch.setattr(fitting, "THRESHOLDS", replace(fitting.THRESHOLDS, rough_step_fall=rough))
         squares.append(float(np.sum(fit(h, windows, iterations=40).residual ** 2)))
     assert squares[1] > 100 * windows.y.size
     assert made.count(0) < made.count(1)

@@ -75,7 +75,7 @@ def test_noise_of_any_colour_is_nothing(colour, velocity):
         found, last = left(recorded(truth(), colour=colour, velocity=velocity, seed=seed, noise=5e-3))
         assert not found.remains
         assert found.growth.sigmas < 3.5
-        assert all(k.share < leftover.LEARNT for k in found.learnt)
+        assert all(k.share < leftover.THRESHOLDS.learnt_share for k in found.learnt)
         assert leftover.verdict(0, found, last, last, experiment=False) == "nothing"
     # Against the white noise floor alone, coloured noise looks like something that grows.
     assert found.growth.growth > 1.06 or colour < 0.6
@@ -85,15 +85,15 @@ def test_noise_of_any_colour_is_nothing(colour, velocity):
 @pytest.mark.parametrize("law", ["quadratic", "cogging"])
 def test_a_missing_law_is_seen_through_the_noise(law, colour):
     found, last = left(recorded(truth(law), colour=colour))
-    assert found.growth.sigmas > leftover.SIGMAS
+    assert found.growth.sigmas > leftover.THRESHOLDS.growth_sigmas
     assert found.remains
     assert leftover.verdict(0, found, last, last, experiment=False) == "unexplained"
 
 
 def test_what_an_integrator_may_leave_is_seen_and_not_told():
     found, _ = left(recorded(truth("slight"), noise=1e-4))
-    assert found.growth.sigmas > leftover.SIGMAS
-    assert 0.0005 < found.share < leftover.SLIGHT
+    assert found.growth.sigmas > leftover.THRESHOLDS.growth_sigmas
+    assert 0.0005 < found.share < leftover.THRESHOLDS.slight_force
     assert not found.remains
 
 
@@ -212,7 +212,7 @@ def test_the_noise_of_a_lack_is_drawn_once(monkeypatch):
     found, _ = left(recorded(truth("slight"), noise=1e-4))
     drawn, plain = [], lackoffit.noise
     monkeypatch.setattr(lackoffit, "noise", lambda *given: drawn.append(given) or plain(*given))
-    monkeypatch.setattr(lackoffit, "SIGMAS", 1.0)
+    monkeypatch.setattr(lackoffit, "THRESHOLDS", replace(lackoffit.THRESHOLDS, lack_sigmas=1.0))
     assert lack(found.long, found.short) is not None
     assert len(drawn) == 1
 
@@ -260,7 +260,7 @@ def test_products_of_what_forces_make_need_no_outputs():
 def test_where_starts_make_nearly_all_outputs_are_made(monkeypatch):
     found, _ = left(recorded(truth("slight"), noise=1e-4))
     lacking, made = lack(found.long, found.short), []
-    monkeypatch.setattr(lackoffit, "LOST", 1.0)
+    monkeypatch.setattr(lackoffit, "THRESHOLDS", replace(lackoffit.THRESHOLDS, told_by_products=1.0))
     monkeypatch.setattr(
         lackoffit._Columns, "made", lambda *given, of=lackoffit._Columns.made: made.append(of(*given)) or made[-1]
     )
@@ -276,7 +276,7 @@ def test_noise_that_starts_follow_has_the_sums_that_are_expected():
     gap = np.abs(np.subtract.outer(np.arange(length), np.arange(length)))
     for d, j in ((0, 0), (1, 5)):
         cover = np.zeros((length, ny, length, ny))
-        cover[:, d, :, d] = whiteness.COLOURS[j] ** gap
+        cover[:, d, :, d] = whiteness.THRESHOLDS.noise_colours[j] ** gap
         keep = np.eye(length * ny) - found.short.free @ np.swapaxes(found.short.free, 1, 2)
         left_over = (keep @ cover.reshape(length * ny, -1) @ keep).reshape(w, length, ny, length, ny)
         sums = whiteness._Expected.of(found.short, found.long).short[..., d, j]

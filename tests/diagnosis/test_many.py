@@ -156,7 +156,7 @@ def test_what_is_left_is_noise_once_the_cause_is_there(monkeypatch):
     assert widths == [1]
     monkeypatch.setattr(searching, "noise", lambda fitted: False)
     EquationSearch(search).forward()
-    assert widths == [1, 1, searching.BEAM]
+    assert widths == [1, 1, searching.THRESHOLDS.beam]
 
 
 @pytest.mark.exam
@@ -186,8 +186,8 @@ def test_of_very_many_candidates_some_are_piled_up(monkeypatch):
     assert stepwise.try_piles() is None
     assert keys(stepwise.forward()[0]) == truth
     for module in (searching, fitted_sets):
-        monkeypatch.setattr(module, "CROWD", 1)
-    monkeypatch.setattr(searching, "ALONE", 0.95)
+        monkeypatch.setattr(module, "THRESHOLDS", replace(module.THRESHOLDS, crowd=1))
+    monkeypatch.setattr(searching, "THRESHOLDS", replace(searching.THRESHOLDS, alone_promise=0.95))
     few = EquationSearch(FittedSets(library, windows))
     monkeypatch.setattr(searching, "additions", None)
     found = few.forward()
@@ -195,7 +195,7 @@ def test_of_very_many_candidates_some_are_piled_up(monkeypatch):
     assert values(found[1])["input_gain_w"] == pytest.approx(0.7, rel=0.01)
     monkeypatch.setattr(GainTable, "pairs", None)  # a pile of all candidates needs no pairs beside it
     assert few.try_pairs(found) is found
-    monkeypatch.setattr(searching, "ALONE", 0.0)
+    monkeypatch.setattr(searching, "THRESHOLDS", replace(searching.THRESHOLDS, alone_promise=0.0))
     assert few.try_piles() is None
 
 
@@ -335,7 +335,7 @@ def test_what_could_stand_in_for_a_cause_is_screened_alone(monkeypatch):
     own = next(c for c in library.candidates if c.key == ("viscous-friction", "b"))
     nothing, found = ((), FittedSets(library, windows).nothing), []
     for crowd in (len(library.candidates) + 1, 1):
-        monkeypatch.setattr(fitted_sets, "CROWD", crowd)
+        monkeypatch.setattr(fitted_sets, "THRESHOLDS", replace(fitted_sets.THRESHOLDS, crowd=crowd))
         found.append(FittedSets(library, windows).promises(nothing, own))
     for every, few in zip(*found, strict=True):
         known = {keys(s.move): s.gain for s in every}
@@ -364,7 +364,7 @@ def test_first_values_beside_nothing_are_those_of_the_pile(monkeypatch):
     plain, piled = FittedSets(library, windows), FittedSets(library, windows)
     c = next(c for c in library.candidates if c.key == ("viscous-friction", "b"))
     expected = next(s for s in plain.promises(((), plain.nothing))[0] if keys(s.move) == {c.key})
-    monkeypatch.setattr(fitted_sets, "CROWD", 1)
+    monkeypatch.setattr(fitted_sets, "THRESHOLDS", replace(fitted_sets.THRESHOLDS, crowd=1))
     monkeypatch.setattr(piled.screen, "rank", None)
     promised = piled.promise(((), piled.nothing), c)
     assert promised is not None
@@ -397,7 +397,7 @@ def test_pushes_that_are_averaged_are_made_once_per_block(monkeypatch):
     library, windows = prepared(laws=("viscous-friction",))
     nothing = FittedSets(library, windows).nothing
     fine = Screen(library, windows, nothing).push(library.candidates[0]).state
-    monkeypatch.setattr(screening, "BLOCK", 0.02)
+    monkeypatch.setattr(screening, "THRESHOLDS", replace(screening.THRESHOLDS, screening_block=0.02))
     coarse = Screen(library, windows, nothing).push(library.candidates[0]).state
     assert coarse.shape == fine.shape
     np.testing.assert_array_equal(coarse[:, ::2], fine[:, ::2])

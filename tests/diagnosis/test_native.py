@@ -11,7 +11,8 @@ from gapcert.contracts.plugins.component import Context
 from gapcert_diagnosis.native.candidates import native_candidates
 from gapcert_diagnosis.native.response_surface import Surface, descend, design
 from gapcert_diagnosis.native.rollouts import ErrorStore, Motions, channels
-from gapcert_diagnosis.native.stepwise import SHIFTS, EngineSearch, NativeFit
+from gapcert_diagnosis.native.stepwise import EngineSearch, NativeFit
+from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_engines.native_model import NativeModel
 
 pytestmark = pytest.mark.contract
@@ -364,10 +365,12 @@ def test_a_setting_is_tried_with_the_last_number_on_both_sides(model):
     known = native_candidates(model, ["contact-friction"], simulated=False)
     (friction,) = (n for n in known if n.native == "friction")
     setting = next(n for n in known if n.label == "cone = pyramidal")
-    found = EngineSearch._variants(NativeFit((friction,), model.restated({"friction": 0.2})), setting, SHIFTS)
+    found = EngineSearch._variants(
+        NativeFit((friction,), model.restated({"friction": 0.2})), setting, THRESHOLDS.setting_shifts
+    )
     assert [m.values["friction"] for _, m in found] == pytest.approx([0.2 * np.exp(-0.2), 0.2, 0.2 * np.exp(0.2)])
     assert {m.of.cone for _, m in found} == {"pyramidal"}
-    ((_, alone),) = EngineSearch._variants(NativeFit((), model), setting, SHIFTS)
+    ((_, alone),) = EngineSearch._variants(NativeFit((), model), setting, THRESHOLDS.setting_shifts)
     assert alone.values == model.values
 
 

@@ -1,6 +1,7 @@
 """What a search must not fall for: each case here once gave a wrong name, an extra one, or none."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -161,7 +162,7 @@ def test_a_needle_between_two_starts_is_found_by_a_local_scan(monkeypatch):
 
     closer = best()
     assert closer.values["cogging_q_period"] == pytest.approx(0.0901, rel=0.01)
-    monkeypatch.setattr(screen, "SCANNED", 0)
+    monkeypatch.setattr(screen, "THRESHOLDS", replace(screen.THRESHOLDS, scanned_moves=0))
     assert best().gain < closer.gain
 
 
@@ -178,7 +179,7 @@ def test_a_cause_below_one_per_cent_of_the_effort_is_listed_and_not_named():
     assert found[0] == ()
     (key, share) = next((k, s) for k, s in search.negligible.items() if k[0] == "viscous-friction")
     assert key == ("viscous-friction", "q")
-    assert 0.001 < share < effort.LEAST
+    assert 0.001 < share < effort.THRESHOLDS.least_effort
 
 
 @pytest.mark.exam

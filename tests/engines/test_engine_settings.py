@@ -215,4 +215,4 @@ def test_with_noise_most_settings_cost_one_step_and_no_fit(tmp_path, monkeypatch
     monkeypatch.setattr(settings, "fit", lambda h, *a, **k: fits.append(h.model) or fit(h, *a, **k))
     found = gc.diagnose(model, gc.Recording.of(tr.t, noisy, hold="zero"), FRICTION, horizons=[0.5])
     assert [(c.effect, c.site) for c in found.causes] == [("viscous-friction", "q")]
-    assert len({id(m) for m in fits}) <= settings.CONTENDERS + 2 < len(model.variants())
+    assert len({id(m) for m in fits}) <= settings.THRESHOLDS.setting_contenders + 2 < len(model.variants())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -203,8 +204,8 @@ def test_any_iterate_is_sound_and_none_without_the_remainder(
     nominal: MpcController, monkeypatch: pytest.MonkeyPatch, bounded: bool
 ) -> None:
     """Plans after one program about a straight line to the target, which no motion follows, in wide boxes."""
-    monkeypatch.setattr(successive, "ROUNDS", 1)
-    monkeypatch.setattr(successive, "FLOORS", (0.3, 0.2))
+    monkeypatch.setattr(successive, "THRESHOLDS", replace(successive.THRESHOLDS, linearisation_rounds=1))
+    monkeypatch.setattr(successive, "THRESHOLDS", replace(successive.THRESHOLDS, move_floors=(0.3, 0.2)))
     along = Nominal.along
 
     def careless(self: Nominal, *args: Array) -> Stages:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from gapcert_bounds.testing.contracts import GapFamilyContract
 from gapcert_bounds.testing.fields import Waves, gap_problem
 from gapcert_neural.banded import BandTraining, Pool
 from gapcert_neural.family import Neural, _Units
+from gapcert_neural.thresholds import THRESHOLDS
 from gapcert_neural.training import Plan
 from gapcert_verify.verify import verify_run
 
@@ -120,7 +122,7 @@ def test_another_seed_trains_another_network() -> None:
 
 
 def test_interrupted_training_resumes_to_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gapcert_neural.training._EVERY", 0.0)
+    monkeypatch.setattr("gapcert_neural.training.THRESHOLDS", replace(THRESHOLDS, checkpoint_seconds=0.0))
     monkeypatch.setattr("gapcert.contracts.plugins.events.BEAT", 0.0)
     whole = Neural(**OPTIONS).fit(problem()).arrays()
 

@@ -31,8 +31,8 @@ def test_sums_are_those_of_the_binomial_distribution(epsilon: float, n: int) -> 
         assert float(c.missed(m, n, epsilon)) == pytest.approx(binom.cdf(m, n, epsilon), rel=1e-9)
     assert c.missed(n, n, epsilon) == 1  # says nothing
     v = c.surprising(n, epsilon)
-    assert v == n + 1 or binom.sf(v - 1, n, epsilon) <= c.SURPRISE * (1 + 1e-9)
-    assert binom.sf(v - 2, n, epsilon) > c.SURPRISE * (1 - 1e-9)
+    assert v == n + 1 or binom.sf(v - 1, n, epsilon) <= c.THRESHOLDS.surprise * (1 + 1e-9)
+    assert binom.sf(v - 2, n, epsilon) > c.THRESHOLDS.surprise * (1 - 1e-9)
 
 
 def test_sums_are_rounded_against_the_claim() -> None:

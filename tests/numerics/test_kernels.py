@@ -203,13 +203,13 @@ def test_a_folder_that_goes_while_it_is_used_is_missed_by_nobody(made, folders):
 
 
 def test_the_newest_folders_stay(made, folders, tmp_path):
-    for k in range(kernels.NEWEST + 2):
+    for k in range(kernels.THRESHOLDS.kept_folders + 2):
         (tmp_path / "kernels_of_a_test" / "more.py").write_text(f"K = {k}")
         made()
         newest = max(folders(), key=lambda f: f.stat().st_mtime_ns)
         for folder in folders():
             os.utime(folder, ns=(0, folder.stat().st_mtime_ns - 10**10))
-    assert len(folders()) == kernels.NEWEST
+    assert len(folders()) == kernels.THRESHOLDS.kept_folders
     assert newest in folders()
 
 

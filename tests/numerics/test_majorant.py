@@ -138,7 +138,7 @@ def test_slopes_along_several_axes_around_any_centre() -> None:
     low, high = np.array([-1.0, -2.0, -1.0]), np.array([1.0, 2.0, 1.0])
     cells, bounds = gc.plugin.cells_of(bound, low, high, centre)
     assert np.prod(cells.hi - cells.lo, axis=1).sum() == pytest.approx(16.0)
-    assert len(cells) <= module.MOST
+    assert len(cells) <= module.THRESHOLDS.majorant_cells
     c, a = gc.plugin.majorant(bounds, cells.lo, cells.hi, centre)
     assert 0.1 <= c[0] <= 0.1 + 0.04 * 1.05
     assert a[0] == pytest.approx([0.2, 0, 0.5], abs=0.03)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -267,7 +268,7 @@ def test_one_ulp_inwards_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(autouse=True)
 def _groups(monkeypatch: pytest.MonkeyPatch) -> None:
     """These problems have few pairs; inputs share slopes all the same."""
-    monkeypatch.setattr(nominal, "FEW", 0)
+    monkeypatch.setattr(nominal, "THRESHOLDS", replace(nominal.THRESHOLDS, single_pairs=0))
 
 
 def grouped(monkeypatch: pytest.MonkeyPatch, size: int) -> None:

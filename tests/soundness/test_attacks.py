@@ -2,6 +2,7 @@
 
 import importlib
 import json
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -102,7 +103,8 @@ def test_a_stochastic_system_has_no_gap_in_x_and_u(tmp_path):
 
 
 def test_the_constant_bound_of_many_samples(tmp_path, monkeypatch):
-    monkeypatch.setattr(importlib.import_module("gapcert.certification.routes"), "_YARDSTICK_SAMPLES", 100)
+    routes = importlib.import_module("gapcert.certification.routes")
+    monkeypatch.setattr(routes, "THRESHOLDS", replace(routes.THRESHOLDS, yardstick_samples=100))
     m = Drift(1)
     family = gc.registry().build("gap_family", "constant")
     options = {"sampling": GridSampling((15, 15)), "family": family, "folder": tmp_path / "run", "route": "dominate"}

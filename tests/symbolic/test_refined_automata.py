@@ -28,6 +28,7 @@ from gapcert_symbolic.games.refined_automata import refined_product
 from gapcert_symbolic.games.refinement import Refined
 from gapcert_symbolic.solvers.problem import Solution
 from gapcert_symbolic.synthesizer import Symbolic
+from gapcert_symbolic.thresholds import THRESHOLDS
 
 AUTOMATA = [*map(automaton_of, ("F (a & F b)", "F a & F b", "!a U b", "F (a & X b)")), read_hoa(AGAIN)]
 
@@ -210,7 +211,7 @@ def test_a_spec_with_a_formula_runs_on_halved_cells(tmp_path: Path) -> None:
 
 
 def test_too_many_positions_are_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gapcert_symbolic.games.refinement.MEMORY", 1e5)
+    monkeypatch.setattr("gapcert_symbolic.games.refinement.THRESHOLDS", replace(THRESHOLDS, memory=1e5))
     given = problem(automaton_of(ROCS), REGIONS)
     with pytest.raises(UsageError, match=r"on level \d need .* GB \(limit 0\); use a smaller number"):
         Symbolic({"x0": 10, "x1": 10}, {"u0": 3, "u1": 3}, refine=2).synthesize(given)

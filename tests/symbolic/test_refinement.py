@@ -291,7 +291,7 @@ def test_what_cannot_be_refined_is_one_sentence(monkeypatch: pytest.MonkeyPatch)
     problem = rod_problem()
     with pytest.raises(UsageError, match=r"controller.refine: align: scots is solved on one grid"):
         Symbolic(align="scots", eta={"theta": 0.01, "omega": 0.01, "torque": 0.1}, refine=1).synthesize(problem)
-    monkeypatch.setattr(refinement, "MEMORY", 1e5)
+    monkeypatch.setattr(refinement, "THRESHOLDS", replace(refinement.THRESHOLDS, memory=1e5))
     with pytest.raises(UsageError, match=r"on level \d need .* GB \(limit 0\); use a smaller number"):
         Symbolic({"theta": 20, "omega": 20}, {"torque": 9}, refine=5).synthesize(problem)
 

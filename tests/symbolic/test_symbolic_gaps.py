@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -78,7 +79,7 @@ def test_coordinates_that_cost_least_go_first(monkeypatch: pytest.MonkeyPatch) -
     last = sizes(whole)
     pairs = np.indices((GRID.size, 35)).reshape(2, -1)
     for entries in (21_000, 3_000, 50):
-        monkeypatch.setattr(gaps, "ENTRIES", entries)
+        monkeypatch.setattr(gaps, "THRESHOLDS", replace(gaps.THRESHOLDS, window_entries=entries))
         short = made(STEEP)
         assert escapes(STEEP, short) == 0
         assert sizes(short) < last
@@ -93,7 +94,7 @@ def test_coordinates_that_cost_least_go_first(monkeypatch: pytest.MonkeyPatch) -
 
 def test_a_supremum_left_out_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
     """The planted fault: of the blocks that share an entry the smallest one counts."""
-    monkeypatch.setattr(gaps, "ENTRIES", 50)
+    monkeypatch.setattr(gaps, "THRESHOLDS", replace(gaps.THRESHOLDS, window_entries=50))
     assert escapes(STEEP, made(STEEP)) == 0
 
     def smallest(self: Any) -> Array:

@@ -131,5 +131,7 @@ def test_both_ways_agree_on_positions(n: int, m: int, seed: int, relations: bool
 
 def test_threads_are_used_where_they_pay_or_are_asked_for() -> None:
     cores = len(os.sched_getaffinity(0))
-    assert [solvers.usable(None, pairs) for pairs in (solvers.LARGE - 1, solvers.LARGE)] == [1, cores]
+    assert [
+        solvers.usable(None, pairs) for pairs in (solvers.THRESHOLDS.threaded_pairs - 1, solvers.THRESHOLDS.threaded_pairs)
+    ] == [1, cores]
     assert solvers.usable(3, 10) == 3

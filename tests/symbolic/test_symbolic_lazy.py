@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -27,7 +28,7 @@ RANGES = {"omega": (-4.0, 4.0), "theta": (-np.pi, np.pi), "torque": (-6.0, 6.0)}
 @pytest.fixture(autouse=True)
 def _large_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """On small grids, too."""
-    monkeypatch.setattr(lazy, "PARTS", 1)
+    monkeypatch.setattr(lazy, "THRESHOLDS", replace(lazy.THRESHOLDS, first_blocks=1))
 
 
 def equations(**derivative: str) -> Model:

@@ -28,6 +28,7 @@ from gapcert.certification.samples.designs import AdaptiveSampling, GridSampling
 from gapcert.certification.samples.executors import Kept, processes
 from gapcert.certification.samples.refinement import refined
 from gapcert.certification.samples.store import Store
+from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.gaps.claim import Claim, audit_size
 from gapcert.contracts.gaps.gap import GapFamily, GapFunction, GapProblem
 from gapcert.contracts.gaps.lipschitz import LipschitzBound, LipschitzEstimator, LipschitzProblem, Residual
@@ -41,8 +42,6 @@ from gapcert.numerics.arrays import Array, Bools
 from gapcert.numerics.digest import json_digest
 from gapcert.numerics.errors import UsageError
 from gapcert.version import __version__
-
-_JUDGED = 25_000  # points that are judged between two reports of progress; chosen, not measured
 
 
 def certify(
@@ -285,10 +284,10 @@ def _violations(gap: GapFunction, z: Array, r: Array) -> tuple[Bools, Bools]:
 def _judged(gap: GapFunction, z: Array, r: Array, pulse: Pulse) -> tuple[Bools, Bools]:
     """`_violations` in blocks, so that one sees how far it is."""
     both = np.empty((2, len(z)), dtype=bool)
-    for a in range(0, len(z), _JUDGED):
-        rows = slice(a, a + _JUDGED)
+    for a in range(0, len(z), THRESHOLDS.judged_points):
+        rows = slice(a, a + THRESHOLDS.judged_points)
         both[:, rows] = _violations(gap, z[rows], r[rows])
-        pulse(min(a + _JUDGED, len(z)), {"violations": int(both[0, : a + _JUDGED].sum())})
+        pulse(min(a + THRESHOLDS.judged_points, len(z)), {"violations": int(both[0, : a + THRESHOLDS.judged_points].sum())})
     return both[0], both[1]
 
 

@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 from gapcert.certification.routes import Route
+from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.gaps.gap import GapFamily
 from gapcert.contracts.gaps.lipschitz import LipschitzEstimator
 from gapcert.contracts.systems.system import Model, StateSpec, System
 from gapcert.numerics.errors import UsageError
-
-SAME = 1e-12  # relative difference up to which two periods are one
 
 
 def unpaired(one: System, other: System) -> str:
@@ -19,7 +18,7 @@ def unpaired(one: System, other: System) -> str:
     for what in ("states", "inputs"):
         if said := unmatched(what, getattr(one, what), getattr(other, what)):
             return said
-    if abs(one.period - other.period) > SAME * one.period:
+    if abs(one.period - other.period) > THRESHOLDS.same_period * one.period:
         return f"its period is {other.period:g} s, the model's {one.period:g} s; set them equal"
     return ""
 

@@ -17,6 +17,7 @@ from gapcert.certification.bounds.supremum import supremum
 from gapcert.certification.certificate import Audit, Ledger, Record
 from gapcert.certification.gates import Gate
 from gapcert.certification.samples.store import Store
+from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.gaps.claim import ClaimKind
 from gapcert.contracts.gaps.gap import GapFamily, GapFunction, GapProblem
 from gapcert.contracts.gaps.predictor import Samples
@@ -26,9 +27,6 @@ from gapcert.contracts.systems.system import Model, System
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.errors import UsageError
 
-_YARDSTICK_SAMPLES = 20_000  # from which on no envelope is made on route theorem1; chosen, not measured
-_SUSPECTS = 200  # samples above γ that are held against all others: one contradiction is enough; chosen, not measured
-_LOOKS = 4e8  # at samples, by the branch and bound behind a constant; chosen, not measured
 Refuted = dict[str, Any]
 
 
@@ -135,7 +133,7 @@ class _Bounded(_Audited):
         if found is not None or not (low := undershoot(gap, problem.samples)).size:
             return found
         # Where two samples contradict the constants no band contains both; else it is the family that is wrong.
-        found = contradiction(problem, suspects=low[:_SUSPECTS])
+        found = contradiction(problem, suspects=low[: THRESHOLDS.suspects])
         if found is None:
             raise UsageError(
                 f"gap: family '{gap.family}' returned a γ below |r| on {low.size} of its own samples, the first at (x, u) = "
@@ -159,7 +157,7 @@ class Theorem1(_Bounded):
 
     def yardsticks(self, gap: GapFunction, problem: GapProblem, record: Record | None, z: Array) -> tuple[Array, Array | None]:
         constant = np.asarray(np.abs(problem.samples.r).max(axis=0) + problem.margin)
-        if gap.family != "envelope" and len(problem.samples) > _YARDSTICK_SAMPLES:
+        if gap.family != "envelope" and len(problem.samples) > THRESHOLDS.yardstick_samples:
             return constant, None  # the envelope of millions of samples costs more than the certificate
         return constant, _envelope(gap, problem).gamma(z).mean(axis=0)
 
@@ -178,7 +176,7 @@ class Dominate(_Bounded):
     def yardsticks(self, gap: GapFunction, problem: GapProblem, record: Record | None, z: Array) -> tuple[Array, Array | None]:
         envelope = _envelope(gap, problem)
         # A box costs a look at every sample; with fewer boxes the bound is proved as well, only less tight.
-        budget = int(np.clip(_LOOKS / max(1, len(problem.samples)), 10_000, 200_000))
+        budget = int(np.clip(THRESHOLDS.constant_looks / max(1, len(problem.samples)), 10_000, 200_000))
         pulse = Pulse(problem.emit, "constant bound", unit="boxes")
         mean = envelope.gamma(z).mean(axis=0)
         return supremum(envelope, problem.domain, budget=budget, pulse=pulse)[0], mean

@@ -11,7 +11,7 @@ from packaging.utils import canonicalize_name
 
 BESIDE = ("all", "dev")
 """Extras that are no group of their own: the sum of the others, and what only the tests need."""
-SHORT = 60
+SHORT = 60  # characters: longer texts are the licence itself
 
 
 @final

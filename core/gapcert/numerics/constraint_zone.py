@@ -13,10 +13,9 @@ import numpy.typing as npt
 from gapcert.numerics.arrays import Array, Bools
 from gapcert.numerics.errors import UsageError
 from gapcert.numerics.intervals import Interval
+from gapcert.thresholds import THRESHOLDS
 
-SHARE = 1e-3  # of the box: relations that leave less are refused
 _DEPTH = 1e-12  # moved points end this far inside (relative), so that rounding cannot push them out
-_STEPS = 8  # per relation, to move a point into Z within its box
 _TINY = float(np.finfo(np.float64).tiny)
 _BLOCK = 1 << 18
 
@@ -98,7 +97,7 @@ class Zone:
             z = low + width * rng.random((block, len(low)))
             found.append(z[self.related(z)])
             drawn, kept = drawn + block, kept + len(found[-1])
-            if drawn >= 20 / SHARE and kept < SHARE * drawn:
+            if drawn >= 20 / THRESHOLDS.zone_share and kept < THRESHOLDS.zone_share * drawn:
                 texts = "; ".join(dict.fromkeys(r.text for r in self.relations))
                 raise UsageError(
                     f"domain.relations: {texts}: {kept} of {drawn} points of the box satisfy them; give ranges of which the "
@@ -128,7 +127,7 @@ class Zone:
         A step goes towards the corner of the box where a·z of the most broken relation is least, as far as that asks.
         """
         z = z.copy()
-        for _ in range(_STEPS * len(self.relations)):
+        for _ in range(THRESHOLDS.zone_steps * len(self.relations)):
             over = self.dots(z) - self.bounds
             rows = np.flatnonzero((over > 0).any(axis=1))
             if not len(rows):

@@ -26,9 +26,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar, cast, final
 
+from gapcert.thresholds import THRESHOLDS
+
 F = TypeVar("F", bound=Callable[..., Any])
 
-NEWEST = 4  # folders of one package that stay: those of other versions, or of other environments
 LISTENERS: list[Callable[[str], None]] = []
 """Who is told, in a sentence, that something has to be compiled."""
 
@@ -187,7 +188,7 @@ def _prune(parent: int, folder: int, package: str) -> None:
         os.utime(folder)
         found = [name for name in os.listdir(parent) if name.rpartition("-")[0] == package]
         found.sort(key=lambda name: os.stat(name, dir_fd=parent).st_mtime)
-        for name in found[:-NEWEST]:
+        for name in found[: -THRESHOLDS.kept_folders]:
             shutil.rmtree(name, ignore_errors=True, dir_fd=parent)
 
 

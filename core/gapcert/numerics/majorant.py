@@ -10,11 +10,8 @@ import numpy.typing as npt
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.errors import UsageError
 from gapcert.numerics.intervals import Interval
+from gapcert.thresholds import THRESHOLDS
 
-MOST = 4096  # cells
-_FIRST, _SHARE = 16, 3  # cut in a round: so many cells at least, and one in so many
-_TRIED = 4  # cells of a round of which every axis is tried
-_GAIN = 0.01  # of the mean, since there were a quarter as many cells: it ends where less was gained
 _EPS = float(np.finfo(np.float64).eps)
 
 Index = npt.NDArray[np.intp]
@@ -47,7 +44,7 @@ def majorant(bounds: Array, low: Array, high: Array, centre: Array, mean: Array 
 
 
 def majorant_of(
-    bound: Bound, low: Array, high: Array, centre: Array, count: int = MOST, mean: Array | None = None
+    bound: Bound, low: Array, high: Array, centre: Array, count: int = THRESHOLDS.majorant_cells, mean: Array | None = None
 ) -> tuple[Array, Array]:
     """(c, A) as `majorant` has them, over the box [low, high]; bound, centre and mean as for `cells_of`.
 
@@ -66,7 +63,7 @@ def majorant_of(
 
 
 def cells_of(
-    bound: Bound, low: Array, high: Array, centre: Array, count: int = MOST, mean: Array | None = None
+    bound: Bound, low: Array, high: Array, centre: Array, count: int = THRESHOLDS.majorant_cells, mean: Array | None = None
 ) -> tuple[Interval, Array]:
     """(cells (m, nz), bounds (m, nx)) that tile the box [low, high] for `majorant`, about `count` cells at most.
 
@@ -76,25 +73,25 @@ def cells_of(
     """
     cells = Interval(low[None], high[None])
     bounds, e = bound(cells), _mean(low, high, centre) if mean is None else mean
-    rates, mark, reached = np.zeros((bounds.shape[1], len(low))), _FIRST, np.inf
+    rates, mark, reached = np.zeros((bounds.shape[1], len(low))), THRESHOLDS.least_cut, np.inf
     while len(cells) + 2 <= count:
         near, top = _near(cells.lo, cells.hi, centre), _tame(bounds)
         unit = np.maximum(top.max(axis=0), np.finfo(float).tiny)
         lines = [_line(b, near, e) for b in top.T]
         if len(cells) >= 4 * mark:
             now = float(sum((c + a @ e) / u for (c, a), u in zip(lines, unit, strict=True)))
-            if now > (1 - _GAIN) * reached:
+            if now > (1 - THRESHOLDS.majorant_gain) * reached:
                 break
             mark, reached = len(cells), now
         slopes = np.array([a for _, a in lines])
         left = (top - near @ slopes.T) / unit
         slack = left.max(axis=0) - left
-        tried = np.argsort((slack - _gains(rates, cells)).min(axis=1), kind="stable")[:_TRIED]
+        tried = np.argsort((slack - _gains(rates, cells)).min(axis=1), kind="stable")[: THRESHOLDS.cut_tried]
         rates = (rates + _rates(bound, cells[tried], bounds[tried], centre, slopes / unit[:, None], unit)) / 2
         # What may bind and gains much comes first: of the cells that bind, small ones can gain little.
         worth = _gains(rates, cells) - slack
         chosen = np.argsort(-worth.max(axis=1), kind="stable")
-        chosen = chosen[: min(max(_FIRST, len(cells) // _SHARE), (count - len(cells)) // 2)]
+        chosen = chosen[: min(max(THRESHOLDS.least_cut, len(cells) // THRESHOLDS.cut_share), (count - len(cells)) // 2)]
         chosen = chosen[worth[chosen].max(axis=1) > 1e-6]
         if not len(chosen):
             break

@@ -23,11 +23,10 @@ import numpy.typing as npt
 
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.errors import UsageError
+from gapcert.thresholds import THRESHOLDS
 
 STREAM = 0xCA11B
 """Calibration k draws its points from (seed, k, STREAM), the audit after it from (seed, k)."""
-SURPRISE = 1e-3
-"""An audit refutes a claim of ε where so many violations, or more, have at most this probability under it."""
 NOISE, NOISE_OF = ", the noise drawn once at each point", ", all of {} draws of the noise at each point"
 WINDOWS = "a further window that is exchangeable with those of the recording, on average over calibrations"
 DRAWN_WINDOWS = "a further window, drawn as those of the recording and independently of them"
@@ -95,7 +94,7 @@ def most_exceedances(n: int, epsilon: float, beta: float) -> int | None:
     return first - 1 if first else None
 
 
-def surprising(n: int, epsilon: float, level: float = SURPRISE) -> int:
+def surprising(n: int, epsilon: float, level: float = THRESHOLDS.surprise) -> int:
     """The smallest v with P(Bin(n, ε) ≥ v) ≤ level, rounded up: so many violations refute ε."""
     _probability("ε", epsilon)
     goal = _UP.subtract(Decimal(1), Decimal(level))

@@ -20,12 +20,10 @@ from typing import Any, final
 from gapcert.contracts.plugins.events import Event, Heart
 from gapcert.numerics.errors import INTERRUPTED, GapcertError, exit_code
 from gapcert.run.lock import myself
+from gapcert.run.thresholds import THRESHOLDS
 from gapcert.version import __version__
 
 NAME = "progress.jsonl"
-PAUSE = 1.0  # seconds between two reports of one stage
-SHORT = 0.1  # seconds between two of different stages
-SILENT = 10.0  # seconds after which a run that has nothing to tell gives a sign of life
 LIMIT = 256 * 1024  # bytes
 LONGEST = 600  # characters of a text
 
@@ -42,7 +40,7 @@ class Journal:
         self._told = self.begin
         self._waiting: Event | None = None
         self._lock = threading.Lock()
-        self._heart = Heart(SILENT, self._beat)
+        self._heart = Heart(THRESHOLDS.silence, self._beat)
         self._file: int | None = None
         self._ended = False
 
@@ -77,7 +75,7 @@ class Journal:
                 self._flush()
                 return self._tell(event)
             now = time.monotonic()
-            if now - self.last < (PAUSE if event.stage == self.stage else SHORT):
+            if now - self.last < (THRESHOLDS.stage_pause if event.stage == self.stage else THRESHOLDS.short_pause):
                 self._waiting = event
                 return None
             self._waiting, self.last, self.stage = None, now, event.stage
@@ -86,7 +84,7 @@ class Journal:
     def _beat(self) -> None:
         """A sign of life where a stage has nothing to tell."""
         with self._lock, suppress(OSError):
-            if time.monotonic() - self._told >= SILENT:
+            if time.monotonic() - self._told >= THRESHOLDS.silence:
                 self._write("alive", self.stage, {})
 
     def finished(self, summary: Mapping[str, Any], code: int) -> None:

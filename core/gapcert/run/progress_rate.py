@@ -6,14 +6,13 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any, final
 
-WINDOW = 30.0  # seconds that a rate is the mean of; shorter stretches jump, longer ones miss that a stage slows down
-LEAST = 3  # reports that a rate rests on, however old they are: some stages report once a minute
-KNOWN = 2.0  # seconds before which a rate is chance
+from gapcert.run.thresholds import THRESHOLDS
 
 
 @final
 class Pace:
-    """Rate = (done now − done then) / time between, over the last WINDOW seconds; unknown at first and after a new start."""
+    """Rate = (done now − done then) / time between, over the last `rate_window` seconds; unknown at first and after a new
+    start."""
 
     def __init__(self) -> None:
         self._seen: deque[tuple[float, float]] = deque()
@@ -24,10 +23,10 @@ class Pace:
         if total != self.total or (self._seen and done < self._seen[-1][1]):
             self._seen.clear()
         self.total = total
-        if len(self._seen) > LEAST and at - self._seen[-2][0] < WINDOW / 100:
+        if len(self._seen) > THRESHOLDS.rate_reports and at - self._seen[-2][0] < THRESHOLDS.rate_window / 100:
             self._seen.pop()
         self._seen.append((at, done))
-        while len(self._seen) > LEAST and at - self._seen[0][0] > WINDOW:
+        while len(self._seen) > THRESHOLDS.rate_reports and at - self._seen[0][0] > THRESHOLDS.rate_window:
             self._seen.popleft()
 
     @property
@@ -40,7 +39,7 @@ class Pace:
         if len(self._seen) < 2:
             return None
         (begin, first), (end, last) = self._seen[0], self._seen[-1]
-        return (last - first) / (end - begin) if end - begin >= KNOWN and last > first else None
+        return (last - first) / (end - begin) if end - begin >= THRESHOLDS.rate_known and last > first else None
 
     def remaining(self, now: float) -> float | None:
         """Seconds from `now`, not below 0; None where the rate or the total is not known."""

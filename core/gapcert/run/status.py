@@ -16,10 +16,10 @@ from gapcert.run.journal import Line
 from gapcert.run.lock import alive, owner
 from gapcert.run.manifest import SPEC, is_run, marked, stored
 from gapcert.run.progress_rate import Pace
+from gapcert.run.thresholds import THRESHOLDS
 
 State = Literal["running", "finished", "interrupted", "failed"]
 STATES: tuple[State, ...] = ("running", "finished", "interrupted", "failed")
-LOST = 600.0  # seconds without a sign after which a run on a machine that cannot be seen counts as dead
 
 
 @final
@@ -91,7 +91,7 @@ def standing(folder: Path) -> Standing:
     ended = last is not None and last["event"] == "run-ended"
     seen = alive(mark) if mark is not None else False
     # Elsewhere nobody can see the process: a fresh report speaks for it.
-    if seen or (seen is None and last is not None and not ended and time.time() - last["t"] < LOST):
+    if seen or (seen is None and last is not None and not ended and time.time() - last["t"] < THRESHOLDS.lost_run):
         return Standing("running", lines, mark)
     if last is not None and ended:
         state: State = last["how"] if last.get("how") in STATES else "failed"

@@ -11,18 +11,9 @@ import numpy.typing as npt
 
 from gapcert import Array, UsageError
 from gapcert.plugin import LipschitzProblem
+from gapcert_bounds.thresholds import THRESHOLDS
 
 from .slopes import around
-
-_ROUNDS = 6
-_FRESH = 0.25  # share of a later round that is drawn from all of Z
-_SURE = 0.02  # share of the largest second difference that the resolution may fake at a shortened distance
-_CLEAR = 16.0  # second differences below so many resolutions tell nothing
-_STEPS = 4  # of the sweep, by four each
-_FLAT = 1.5  # what grows by less has settled
-_GROWN = 2.5  # on the mean a kink grows fourfold with each step, a jump or noise sixteenfold
-_TRAILS = 3  # of the largest, per state and axis, and as many at random
-LEAST = 60
 
 
 @final
@@ -64,8 +55,11 @@ def curvatures(
         raise UsageError(
             f"lipschitz {method}: curvature of a residual whose hidden state is drawn is not defined; leave it out"
         )
-    if count < LEAST:
-        raise UsageError(f"lipschitz {method}: {count} second differences per axis are too few; give a budget for {LEAST}")
+    if count < THRESHOLDS.least_differences:
+        raise UsageError(
+            f"lipschitz {method}: {count} second differences per axis are too few; give a budget for "
+            f"{THRESHOLDS.least_differences}"
+        )
     nx = problem.domain.nx
     value, report, spent = np.zeros((nx, len(problem.domain.axes))), list[dict[str, Any]](), 0
     for j, name in names.items():
@@ -77,7 +71,7 @@ def curvatures(
             inert = bool((found.change[:, i] <= noise[i]).all())
             kind, distances, values = trails.judge(i)
             # The shortest steps of a trail may be a quarter noise.
-            clear = [v for h, v in zip(distances, values, strict=True) if v * h**2 * _SURE > noise[i]]
+            clear = [v for h, v in zip(distances, values, strict=True) if v * h**2 * THRESHOLDS.bend_faked > noise[i]]
             seen = max([float(_sure(found, noise)[:, i].max()), *clear])
             if inert:
                 value[i, j] = 2 * noise[i] / float(found.step.max()) ** 2
@@ -96,11 +90,13 @@ def _sure(found: Bends, noise: Array) -> Array:
 def _search(problem: LipschitzProblem, j: int, name: str, count: int, distance: float) -> tuple[Bends, int]:
     """(second differences along axis j, how many were asked for): at random first, then around the largest, ever closer."""
     rng = np.random.default_rng([problem.seed, j, 0xC07E])
-    noise, each = 4 * problem.change_resolution, count // (_ROUNDS + 1)
+    noise, each = 4 * problem.change_resolution, count // (THRESHOLDS.bend_rounds + 1)
     longest = distance * problem.domain.width[j]
-    found = Bends.ask(problem, f"curvature-{name}-0", j, *_random(problem, j, rng, count - (_ROUNDS - 1) * each, longest))
-    for k in range(1, _ROUNDS):
-        z, step = _around(problem, j, rng, found, noise, each - int(_FRESH * each), longest, k)
+    found = Bends.ask(
+        problem, f"curvature-{name}-0", j, *_random(problem, j, rng, count - (THRESHOLDS.bend_rounds - 1) * each, longest)
+    )
+    for k in range(1, THRESHOLDS.bend_rounds):
+        z, step = _around(problem, j, rng, found, noise, each - int(THRESHOLDS.bend_fresh * each), longest, k)
         fresh, far = _random(problem, j, rng, each - len(z), longest)
         found = found + Bends.ask(problem, f"curvature-{name}-{k}", j, np.concatenate([fresh, z]), np.append(far, step))
     return found, len(found.step)
@@ -142,7 +138,7 @@ def _around(
     """Up to `most` centres and steps around each state's largest second differences."""
     size = _sure(found, noise)
     state, z = around(problem, rng, found.centre, size, most, k)
-    needed = np.sqrt(noise / (_SURE * np.maximum(size.max(axis=0), np.finfo(float).tiny)))
+    needed = np.sqrt(noise / (THRESHOLDS.bend_faked * np.maximum(size.max(axis=0), np.finfo(float).tiny)))
     step = np.clip(np.maximum(needed[state], longest * 0.5**k), None, longest)
     # At the faces of Z the triple is moved inside, so that what is largest there is met as well.
     low, high = problem.domain.chord(z, j)
@@ -167,15 +163,15 @@ class _Trails:
 
     @classmethod
     def follow(cls, problem: LipschitzProblem, j: int, name: str, found: Bends) -> _Trails:
-        nx, clear = problem.domain.nx, _CLEAR * problem.change_resolution
-        top = np.argsort(-_sure(found, clear / 4), axis=0, kind="stable")[:_TRAILS]
-        pick = np.concatenate([np.concatenate([top[:, i], np.arange(_TRAILS)]) for i in range(nx)])
-        state = np.concatenate([np.repeat([i, -1 - i], [len(top), _TRAILS]) for i in range(nx)])
+        nx, clear = problem.domain.nx, THRESHOLDS.bend_clear * problem.change_resolution
+        top = np.argsort(-_sure(found, clear / 4), axis=0, kind="stable")[: THRESHOLDS.bend_trails]
+        pick = np.concatenate([np.concatenate([top[:, i], np.arange(THRESHOLDS.bend_trails)]) for i in range(nx)])
+        state = np.concatenate([np.repeat([i, -1 - i], [len(top), THRESHOLDS.bend_trails]) for i in range(nx)])
         own = np.where(state < 0, -1 - state, state)
         z, h, change = found.centre[pick], found.step[pick], found.change[pick, own]
-        step, size = np.full((2, len(pick), _STEPS + 1), np.nan)
+        step, size = np.full((2, len(pick), THRESHOLDS.bend_steps + 1), np.nan)
         rows, spent, beside = np.arange(len(pick)), 0, np.arange(-4, 5)
-        for k in range(_STEPS + 1):
+        for k in range(THRESHOLDS.bend_steps + 1):
             if k:
                 # Nine points, a quarter of the last distance apart: seven second differences, the largest of which goes on.
                 quarter = h[rows] / 4
@@ -202,16 +198,16 @@ class _Trails:
         length = np.isfinite(self.size).sum(axis=1)
         growth = np.array([self._growth(row, int(n)) for row, n in enumerate(length)])
         row = int(mine[np.argmax(np.nan_to_num(growth[mine], nan=0.0))])
-        if not growth[row] > _GROWN:
+        if not growth[row] > THRESHOLDS.bend_growth:
             last = [self.size[m, max(0, length[m] - 1)] for m in mine]
             row = int(mine[np.argmax(np.nan_to_num(last))])
         n = int(length[row])
         own = self.step[row, :n].tolist(), self.size[row, :n].tolist()
         if n < 3:
             return "unresolved", *own
-        if growth[row] > _GROWN:
-            return "noise" if (growth[random] > _GROWN).sum() * 2 > len(random) else "kink", *own
-        return "smooth" if own[1][-1] <= _FLAT * own[1][-2] else "unresolved", *own
+        if growth[row] > THRESHOLDS.bend_growth:
+            return "noise" if (growth[random] > THRESHOLDS.bend_growth).sum() * 2 > len(random) else "kink", *own
+        return "smooth" if own[1][-1] <= THRESHOLDS.bend_settled * own[1][-2] else "unresolved", *own
 
     def _growth(self, row: int, n: int) -> float:
         """By what factor a trail grew in each of its last two steps, on the mean; less than that if one of them was flat."""
@@ -219,4 +215,4 @@ class _Trails:
             return float("nan")
         a, b, c = self.size[row, n - 3 : n]
         # A kink may lie anywhere between the points, which makes single factors of 2 to 8 out of its 4.
-        return float(np.sqrt(c / a) if min(b / a, c / b) > _FLAT else min(b / a, c / b))
+        return float(np.sqrt(c / a) if min(b / a, c / b) > THRESHOLDS.bend_settled else min(b / a, c / b))

@@ -8,16 +8,11 @@ import numpy as np
 
 from gapcert import Array, UsageError
 from gapcert.plugin import LipschitzBound, LipschitzEstimator, LipschitzProblem
+from gapcert_bounds.thresholds import THRESHOLDS
 
 from .bends import curvatures
-from .slopes import NOISE, Close, around, inert, uniform
+from .slopes import Close, around, inert, uniform
 from .sweep import Curvature, estimate
-
-_ROUNDS = 8
-_FIRST = 2  # parts of the pairs that the first round has, of which each later one has one
-_FRESH = 0.25  # share of a later round that is drawn from all of Z
-_SHORTEST = 1 / 16  # of the distance
-_SURE = 0.02  # share of the largest slope that the resolution may fake at a shortened pair
 
 
 @final
@@ -45,7 +40,7 @@ class GradientElite(LipschitzEstimator):
         names = {j: a.name for j, a in enumerate(problem.domain.axes) if j not in problem.held}
         share = 2 if self.curvature else 1
         count = self.budget // (2 * share * len(names))
-        least = 4 * (_ROUNDS - 1 + _FIRST)
+        least = 4 * (THRESHOLDS.elite_rounds - 1 + THRESHOLDS.elite_first)
         if count < least:
             raise UsageError(
                 f"lipschitz gradient-elite: a budget of {self.budget} transitions is {count} pairs for each of "
@@ -61,7 +56,7 @@ class GradientElite(LipschitzEstimator):
             pairs[j] = close
             diagnostics[name] = {"inert": still.tolist(), "largest_slope": seen.tolist(), "pairs": len(slope)}
             diagnostics[name]["largest_slope_of_random_pairs"] = first.slope.max(axis=0).tolist()
-        method = f"gradient-elite ({count} pairs in {_ROUNDS} rounds per axis)"
+        method = f"gradient-elite ({count} pairs in {THRESHOLDS.elite_rounds} rounds per axis)"
 
         def bent() -> Curvature:
             each = self.budget // (6 * len(names))
@@ -72,16 +67,16 @@ class GradientElite(LipschitzEstimator):
     def _search(self, problem: LipschitzProblem, j: int, name: str, count: int, noise: Array) -> tuple[Close, Close, Array]:
         """(pairs of the first round, all pairs, their slopes (n, nx), 0 where the resolution may fake them) along axis j."""
         rng = np.random.default_rng([problem.seed, j, 0xE117])
-        each = count // (_ROUNDS - 1 + _FIRST)
-        ends = uniform(problem, j, rng, count - (_ROUNDS - 1) * each, self.distance, "gradient-elite")
+        each = count // (THRESHOLDS.elite_rounds - 1 + THRESHOLDS.elite_first)
+        ends = uniform(problem, j, rng, count - (THRESHOLDS.elite_rounds - 1) * each, self.distance, "gradient-elite")
         first = close = Close.ask(problem, f"lipschitz-{name}-0", j, *ends)
         slope = close.slope
-        for k in range(1, _ROUNDS):
-            near = self._around(problem, j, rng, close, slope, noise, each - int(_FRESH * each), k)
+        for k in range(1, THRESHOLDS.elite_rounds):
+            near = self._around(problem, j, rng, close, slope, noise, each - int(THRESHOLDS.elite_fresh * each), k)
             fresh = uniform(problem, j, rng, each - len(near[0]), self.distance, "gradient-elite")
             more = (np.concatenate(both) for both in zip(fresh, near, strict=True))
             close = close + Close.ask(problem, f"lipschitz-{name}-{k}", j, *more)
-            slope = np.where(close.change * NOISE > noise, close.slope, 0.0)
+            slope = np.where(close.change * THRESHOLDS.noise_share > noise, close.slope, 0.0)
             slope[: len(first.start)] = first.slope
         return first, close, slope
 
@@ -100,8 +95,8 @@ class GradientElite(LipschitzEstimator):
         domain = problem.domain
         state, z = around(problem, rng, (close.start + close.end) / 2, slope, most, k)
         longest = self.distance * domain.width[j]
-        needed = noise / (_SURE * np.maximum(slope.max(axis=0), np.finfo(float).tiny))
-        step = np.clip(np.maximum(needed[state], longest * max(_SHORTEST, 0.5**k)), None, longest)
+        needed = noise / (THRESHOLDS.slope_faked * np.maximum(slope.max(axis=0), np.finfo(float).tiny))
+        step = np.clip(np.maximum(needed[state], longest * max(THRESHOLDS.shortest_pair, 0.5**k)), None, longest)
         low, high = domain.chord(z, j)
         start, end = z.copy(), z.copy()
         ahead = z[:, j] + step <= high

@@ -10,11 +10,9 @@ import numpy as np
 
 from gapcert import Array, Domain, Interval
 from gapcert.plugin import Cells
+from gapcert_bounds.thresholds import THRESHOLDS
 
 from .cell_tree import Leaf, Tree
-
-_ENOUGH = 1e-3  # of the cost of one cell for all: what is left to gain by further cuts
-_FINEST = 8  # parts of a cell per axis
 
 
 @final
@@ -33,7 +31,7 @@ class Slopes:
     def counts(self) -> tuple[int, ...]:
         """Parts of a cell per axis: 2, 4 or 8, and 1 along axes that are not cut."""
         most = int(np.log2(max(1, self.parts)) / max(1, len(self.axes)))
-        count = int(np.clip(2**most, 2, _FINEST))
+        count = int(np.clip(2**most, 2, THRESHOLDS.finest_cut))
         return tuple(count if j in self.axes else 1 for j in range(len(self.domain.low)))
 
     @property
@@ -98,7 +96,7 @@ def cells(slopes: Slopes, most: int) -> Cells:
     total, closed = float((slopes.everywhere * slopes.price).sum()), set[int]()
     while len(patches) < most:
         promises = [0.0 if id(p.leaf) in closed else p.promise for p in patches]
-        if sum(promises) <= _ENOUGH * total:
+        if sum(promises) <= THRESHOLDS.cut_gain * total:
             break
         at = int(np.argmax(promises))
         patch = patches[at]

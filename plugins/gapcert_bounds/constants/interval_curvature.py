@@ -9,13 +9,9 @@ import numpy.typing as npt
 
 from gapcert import Array, Interval, Model
 from gapcert.plugin import LipschitzBound, LipschitzProblem
+from gapcert_bounds.thresholds import THRESHOLDS
 
 Index = npt.NDArray[np.intp]
-
-_NEAR = 0.01  # a bound that a second derivative comes so close to is not improved
-_PARTS = 16  # of an axis at least, put together again where slabs are fewer
-_LITTLE = 0.005  # of that sum: what fewer slabs may cost
-_SLIGHT = 1e-6  # of the Lipschitz constant over the width of the axis: what is not worth improving
 
 
 def proved(problem: LipschitzProblem, fhat: Model, whole: LipschitzBound, slabs: int, most: int) -> LipschitzBound:
@@ -23,7 +19,7 @@ def proved(problem: LipschitzProblem, fhat: Model, whole: LipschitzBound, slabs:
 
     ∞ in a slab that may hold a kink, and along axes that are held.
     """
-    parts = max(_PARTS, 4 * slabs)
+    parts = max(THRESHOLDS.curvature_parts, 4 * slabs)
     domain, columns, cut = problem.domain, list[Array](), list[tuple[Array, Array] | None]()
     for j, (low, high) in enumerate(zip(domain.low, domain.high, strict=True)):
         if j in problem.held:
@@ -31,7 +27,7 @@ def proved(problem: LipschitzProblem, fhat: Model, whole: LipschitzBound, slabs:
             cut.append(None)
             continue
         cuts, width = np.linspace(low, high, parts + 1), domain.width[j]
-        slight = _SLIGHT * whole.value[:, j] / width + problem.resolution / width**2
+        slight = THRESHOLDS.slight_curvature * whole.value[:, j] / width + problem.resolution / width**2
         found = _Search(problem, fhat, j, cuts, slight).run(max(1, most // parts))
         cuts, found = merged(cuts, found, whole.value[:, j], slabs)
         columns.append(found.max(axis=1))
@@ -57,7 +53,7 @@ def merged(cuts: Array, found: Array, slope: Array, slabs: int) -> tuple[Array, 
         before.append(total.argmin(axis=0))
     costs = np.array([b[n] for b in best])
     ends = [n]
-    for k in reversed(range(int(np.argmax(costs <= costs.min() * (1 + _LITTLE))) + 1)):
+    for k in reversed(range(int(np.argmax(costs <= costs.min() * (1 + THRESHOLDS.slab_cost))) + 1)):
         ends.append(int(before[k][ends[-1]]))
     ends = ends[::-1]
     return cuts[ends], np.maximum.reduceat(found, ends[:-1], axis=1)
@@ -107,7 +103,7 @@ class _Search:
         """(boxes, nx): bounds relative to the largest in their slab; 0 where they need not become smaller."""
         top = np.zeros(self.reached.shape)
         np.maximum.at(top, self.slab, self.bound)
-        top, enough = top[self.slab], (self.reached * (1 + _NEAR))[self.slab]
+        top, enough = top[self.slab], (self.reached * (1 + THRESHOLDS.curvature_near))[self.slab]
         share = np.divide(self.bound, top, out=np.ones_like(top), where=np.isfinite(top) & (top > 0))
         # Where one box of a slab has no bound, the others need none.
         share = np.where(np.isinf(top) & np.isfinite(self.bound), 0.0, share)

@@ -12,13 +12,13 @@ import numpy as np
 
 from gapcert import Array, Interval, Model, UsageError
 from gapcert.plugin import LipschitzBound, LipschitzEstimator, LipschitzProblem, ModelPredictor
+from gapcert_bounds.thresholds import THRESHOLDS
 
 from .interval_cells import Slopes, cells
 from .interval_curvature import halves, proved
 
 Bend = float | Sequence[Sequence[float]]
 T = TypeVar("T")
-_MOST_AXES = 12  # a cell is looked at in two parts per axis or more
 
 
 @final
@@ -109,9 +109,9 @@ class IntervalJacobian(LipschitzEstimator):
 
     def _cut(self, problem: LipschitzProblem, whole: LipschitzBound) -> LipschitzBound:
         fhat, axes = problem.white_box, tuple(j for j in range(len(problem.domain.low)) if j not in problem.held)
-        if fhat is None or len(axes) > _MOST_AXES:
+        if fhat is None or len(axes) > THRESHOLDS.cell_axes:
             raise UsageError(
-                f"lipschitz interval: cells are cut along at most {_MOST_AXES} axes, found {len(axes)}; use cells: 1"
+                f"lipschitz interval: cells are cut along at most {THRESHOLDS.cell_axes} axes, found {len(axes)}; use cells: 1"
             )
         parts = self.boxes // self.cells
         made = cells(Slopes(problem.domain, lambda b: _slopes(fhat, problem, b).mag, whole.value, axes, parts), self.cells)

@@ -9,18 +9,10 @@ import numpy as np
 
 from gapcert import Array, UsageError
 from gapcert.plugin import Bools, Cells, LipschitzBound, LipschitzEstimator, LipschitzProblem
+from gapcert_bounds.thresholds import THRESHOLDS
 
 from .cell_tree import Leaf, Tree, edges
 from .pairs import Answers, Index, Pairs
-
-_ON_PAIRS, _ON_TRAILS = 0.4, 0.6  # shares of the budget: spent on close pairs, and after following them
-_LATEST = 1.5  # of the budget, at most: a jump that was found is pursued to its end
-_LEAST = 100  # pairs per axis that constants are made from: the largest of so many rarely misses the top sixth
-_AROUND = 0.25  # of a box's width, on each side of it
-_CLEAR = 16.0  # changes below so many resolutions tell nothing
-_FINER = 64  # trails end at this fraction of the thinnest cell
-_MOST_AXES = 8
-_TOGETHER = 400  # points of a cell that are compared with each other
 
 
 @final
@@ -42,10 +34,10 @@ class Piecewise(LipschitzEstimator):
 
     def bound(self, problem: LipschitzProblem) -> LipschitzBound:
         """UsageError where there are too many axes for the corners of a box."""
-        if len(problem.domain.low) > _MOST_AXES:
+        if len(problem.domain.low) > THRESHOLDS.piecewise_axes:
             raise UsageError(
                 f"lipschitz piecewise: {len(problem.domain.low)} states and inputs; it looks at all corners of its cells, of "
-                f"which {_MOST_AXES} axes make {2**_MOST_AXES}; use wood-zhang"
+                f"which {THRESHOLDS.piecewise_axes} axes make {2**THRESHOLDS.piecewise_axes}; use wood-zhang"
             )
         return _Search(problem, self).bound()
 
@@ -77,7 +69,7 @@ class _Search:
 
     def _draw(self) -> None:
         """Close pairs along each axis, uniform on Z."""
-        o, count = self.options, max(2, int(_ON_PAIRS * self.options.budget / (2 * len(self.axes))))
+        o, count = self.options, max(2, int(THRESHOLDS.pair_share * self.options.budget / (2 * len(self.axes))))
         segments, axes = [], []
         for j in self.axes:
             rng = np.random.default_rng([self.problem.seed, j, 0xCE11])
@@ -102,7 +94,7 @@ class _Search:
         """Batch after batch of the steepest pairs of each state and axis, until none of a batch grows: the rest are slopes."""
         slopes = self.pairs.slopes(self.pair_noise)
         jumped = np.zeros(len(slopes), dtype=bool)
-        clear = self.pairs.change > _CLEAR * self.noise
+        clear = self.pairs.change > THRESHOLDS.change_clear * self.noise
         queues = {}
         for j in self.axes:
             own = self.pairs.axis == j
@@ -110,7 +102,7 @@ class _Search:
             for i in range(self.nx):
                 rows = np.flatnonzero(own & clear[:, i] & (slopes[:, i] > 3 * usual[i]))
                 queues[i, j] = rows[np.argsort(-slopes[rows, i], kind="stable")]
-        while queues and len(self.answers) < _ON_TRAILS * self.options.budget:
+        while queues and len(self.answers) < THRESHOLDS.trail_share * self.options.budget:
             batch = [(i, j, row) for (i, j), rows in queues.items() for row in rows[:16]]
             if not batch:
                 break
@@ -128,7 +120,9 @@ class _Search:
     def _pursue(self, segments: Array, state: Index, enough: Array | None = None) -> Bools:
         """Follow segments for one state each: jumps are recorded, settled slopes become pairs; (n,) where one jumped."""
         long = (np.abs(segments[:, 1] - segments[:, 0]) / self.domain.width).max(axis=1)
-        steps = np.ceil(np.log(np.maximum(long * _FINER / self.options.thinnest, 1.0)) / np.log(4.0)).astype(np.intp)
+        steps = np.ceil(np.log(np.maximum(long * THRESHOLDS.trail_end / self.options.thinnest, 1.0)) / np.log(4.0)).astype(
+            np.intp
+        )
         trails = self.answers.follow(segments, state, self.noise, np.maximum(steps, 3), enough)
         grew = trails.growing
         self._record(trails.z[grew], np.eye(self.nx)[state[grew]] * trails.change[grew])
@@ -148,7 +142,7 @@ class _Search:
         """
         width = region[1] - region[0]
         slopes = self.pairs.steepest(
-            self.pairs.within(region[0] - _AROUND * width, region[1] + _AROUND * width), self.pair_noise
+            self.pairs.within(region[0] - THRESHOLDS.cell_pad * width, region[1] + THRESHOLDS.cell_pad * width), self.pair_noise
         )
         constants = self.options.safety * slopes + self.pair_noise[:, None] / width
         constants[:, list(self.problem.held)] = 0.0
@@ -176,7 +170,7 @@ class _Search:
 
     def _own_region(self, leaf: Leaf) -> bool:
         """Take the leaf's own box as its region if it holds pairs enough."""
-        if self.pairs.count(self.pairs.within(leaf.low, leaf.high), self.axes) >= _LEAST:
+        if self.pairs.count(self.pairs.within(leaf.low, leaf.high), self.axes) >= THRESHOLDS.cell_pairs:
             leaf.region = (leaf.low, leaf.high)
         return leaf.region[0] is leaf.low
 
@@ -219,7 +213,7 @@ class _Search:
 
     def _pursue_jumps(self) -> None:
         """Search the edges of all cells with a jump, and then those of the cells that it is found to reach into."""
-        while len(self.answers) < _LATEST * self.options.budget:
+        while len(self.answers) < THRESHOLDS.jump_budget * self.options.budget:
             pending = [leaf for leaf in self.tree.leaves if not leaf.searched and self._hits(leaf).any()]
             if not pending:
                 return
@@ -268,7 +262,7 @@ class _Search:
         segments, states, enough = [], [], []
         for leaf, (z, known) in zip(leaves, corners, strict=True):
             g = self.answers(z)
-            change, clear = np.abs(g[second] - g[first]), _CLEAR * self.noise
+            change, clear = np.abs(g[second] - g[first]), THRESHOLDS.change_clear * self.noise
             allowed = np.abs(z[second] - z[first]) @ self._constants(leaf.region).T
             change[~(known[first] & known[second])] = 0.0
             excess = np.maximum(change - allowed - clear, 0.0)
@@ -326,7 +320,7 @@ class _Search:
         """Constants (nx, nz) and jumps (nx,) of a leaf, widened until they allow whatever is known of it."""
         constants, jumps = self._constants(leaf.region), self.options.safety * self._jump(leaf)
         rows = np.flatnonzero(leaf.holds(self.answers.z, self.answers.z))
-        rows = rows[np.linspace(0, len(rows) - 1, min(_TOGETHER, len(rows))).astype(int)]
+        rows = rows[np.linspace(0, len(rows) - 1, min(THRESHOLDS.compared_points, len(rows))).astype(int)]
         z, g = self.answers.z[rows], self.answers.g[rows]
         a, b = np.triu_indices(len(rows), 1)
         apart, change = np.abs(z[a] - z[b]), np.maximum(np.abs(g[a] - g[b]) - self.noise, 0.0)

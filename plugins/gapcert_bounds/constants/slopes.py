@@ -10,10 +10,7 @@ import numpy.typing as npt
 
 from gapcert import Array, UsageError
 from gapcert.plugin import LipschitzProblem
-
-NOISE = 0.1  # share of the largest slope that the resolution may fake
-_ELITES = 8  # per state and axis
-_WIDE = 0.3  # of the domain's width: how far around an elite the second round looks; half as far in each later one
+from gapcert_bounds.thresholds import THRESHOLDS
 
 
 @final
@@ -100,19 +97,19 @@ def around(
     """(states (n,), points of Z (n, nz)) around the middles (m, nz) where a state's size (m, nx) is largest, in round k."""
     domain = problem.domain
     state = np.arange(most) % domain.nx
-    order = np.argsort(-size, axis=0, kind="stable")[:_ELITES]
+    order = np.argsort(-size, axis=0, kind="stable")[: THRESHOLDS.elites]
     middle = middles[order[rng.integers(len(order), size=most), state]]
-    wide = _WIDE * 0.5 ** (k - 1) * domain.width
+    wide = THRESHOLDS.elite_reach * 0.5 ** (k - 1) * domain.width
     return state, domain.reach(middle, np.clip(middle + wide * rng.standard_normal(middle.shape), domain.low, domain.high))
 
 
 def inert(problem: LipschitzProblem, j: int, pairs: Close, seen: Array, noise: Array, method: str) -> npt.NDArray[np.bool_]:
     """Which states do not change along axis j beyond the resolution; UsageError where longer pairs would tell."""
     length = float(pairs.length.min())
-    drowned = noise / length > NOISE * seen
+    drowned = noise / length > THRESHOLDS.noise_share * seen
     hidden = drowned & (pairs.change.max(axis=0) > noise)
     for i in np.flatnonzero(hidden):
-        needed = 2 * noise[i] / (NOISE * seen[i] * problem.domain.width[j])
+        needed = 2 * noise[i] / (THRESHOLDS.noise_share * seen[i] * problem.domain.width[j])
         if needed <= 1:
             name, state = problem.domain.axes[j].name, problem.domain.axes[i].name
             raise UsageError(

@@ -10,17 +10,11 @@ import numpy.typing as npt
 
 from gapcert import Array
 from gapcert.plugin import LipschitzBound, LipschitzProblem, Trails
+from gapcert_bounds.thresholds import THRESHOLDS
 
 from .slopes import Close
 
 Index = npt.NDArray[np.intp]
-
-_STEPS = 6  # by four each: down to 1/4096 of the pair
-_PARTS = 4
-_CLEAR = 64.0  # changes below so many resolutions tell nothing
-_FLAT = 1.5  # a slope that grows by less has settled
-_GROWN = 4.0  # noise multiplies slopes by 16 in two steps
-_ALONE = 8.0  # times the random pairs' changes: what is left at a steep pair is a jump, and not the noise of all pairs
 
 
 Curvature = tuple[Array, list[dict[str, Any]], int]
@@ -79,10 +73,10 @@ def _steep(problem: LipschitzProblem, pairs: Mapping[int, Close]) -> tuple[Trail
         axes.append(np.full(len(segments[-1]), j))
     z, state, axis = np.concatenate(segments), np.concatenate(states), np.concatenate(axes)
     rows, spent = np.arange(len(z)), 0
-    slope, lengths = np.full((2, len(z), _STEPS + 1), np.nan)
+    slope, lengths = np.full((2, len(z), THRESHOLDS.sweep_steps + 1), np.nan)
     g, settled = np.zeros((len(z), 2, nx)), np.zeros(len(z), dtype=bool)
-    t, clear_of = np.linspace(0, 1, _PARTS + 1)[:, None], _CLEAR * problem.change_resolution
-    for k in range(_STEPS + 1):
+    t, clear_of = np.linspace(0, 1, THRESHOLDS.sweep_parts + 1)[:, None], THRESHOLDS.sweep_clear * problem.change_resolution
+    for k in range(THRESHOLDS.sweep_steps + 1):
         a, b = z[rows, :1], z[rows, 1:]
         # The first round looks at the pairs themselves, which a resolution may already hide.
         points = np.concatenate([a, b], axis=1) if k == 0 else np.clip(a * (1 - t) + b * t, np.minimum(a, b), np.maximum(a, b))
@@ -98,7 +92,7 @@ def _steep(problem: LipschitzProblem, pairs: Mapping[int, Close]) -> tuple[Trail
         g[rows, 1] = moved[each, best]
         lengths[rows, k], slope[rows, k] = length[clear], change[each, best] / length[clear]
         if k > 1:
-            settled[rows] = slope[rows, k] <= _FLAT * slope[rows, 0]
+            settled[rows] = slope[rows, k] <= THRESHOLDS.slope_settled * slope[rows, 0]
             rows = rows[~settled[rows]]
         if not len(rows):
             break
@@ -120,17 +114,17 @@ def _random(problem: LipschitzProblem, pairs: Mapping[int, Close]) -> tuple[dict
     start, end = (np.concatenate([getattr(c, side)[: few[j]] for j, c in pairs.items()]) for side in ("start", "end"))
     owner = np.concatenate([np.full(few[j], j) for j in pairs])
     rows, spent = np.arange(len(start)), 0
-    lengths = np.full((_STEPS + 1, len(start)), np.nan)
-    slopes = np.full((_STEPS + 1, len(start), problem.domain.nx), np.nan)
-    for k in range(_STEPS + 1):
-        part = float(_PARTS) ** -k
+    lengths = np.full((THRESHOLDS.sweep_steps + 1, len(start)), np.nan)
+    slopes = np.full((THRESHOLDS.sweep_steps + 1, len(start), problem.domain.nx), np.nan)
+    for k in range(THRESHOLDS.sweep_steps + 1):
+        part = float(THRESHOLDS.sweep_parts) ** -k
         a = start[rows]
         b = a * (1 - part) + end[rows] * part
         length = b[np.arange(len(rows)), owner[rows]] - a[np.arange(len(rows)), owner[rows]]
         moved, resolution = problem.change(f"sweep-random-{k}", a, b)
         spent += 2 * len(rows)
         change = np.abs(moved)
-        clear = (change > _CLEAR * resolution) & (length > 0)[:, None]
+        clear = (change > THRESHOLDS.sweep_clear * resolution) & (length > 0)[:, None]
         lengths[k, rows] = length
         slopes[k, rows] = np.where(clear, change / np.where(length > 0, length, 1.0)[:, None], np.nan)
         rows = rows[clear.any(axis=1)]
@@ -149,13 +143,13 @@ def _judge(trails: Trails, lengths: Array, rows: Index, distance: Array, random:
     many = np.isfinite(random).sum(axis=1) * 2 > random.shape[1]
     levels = int(many.sum()) if many.all() else int(many.argmin())
     typical, apart = np.array([np.nanmedian(random[k]) for k in range(levels)]), np.nanmedian(distance[:levels], axis=1)
-    noisy = levels > 2 and typical[-1] > _GROWN * max(typical[0], typical[-3])
+    noisy = levels > 2 and typical[-1] > THRESHOLDS.slope_growth * max(typical[0], typical[-3])
     # Of several steps, as single changes of noise differ much.
     usual = np.nanmax((random * distance)[max(0, levels - 3) : levels], initial=0.0)
-    if noisy and not (growing.any() and final[pick] * own[0][-1] > _ALONE * usual):
+    if noisy and not (growing.any() and final[pick] * own[0][-1] > THRESHOLDS.jump_alone * usual):
         return "noise", apart.tolist(), typical.tolist()
     if growing.any():
         return "jump", *own
-    if steps < 1 or own[1][-1] > _FLAT * own[1][-2]:
+    if steps < 1 or own[1][-1] > THRESHOLDS.slope_settled * own[1][-2]:
         return "unresolved", *own
     return "smooth", *own

@@ -8,9 +8,9 @@ from typing import final
 import numpy as np
 
 from gapcert import Array
+from gapcert_bounds.thresholds import THRESHOLDS
 
 _DROP = 1.352771727047702  # half the 90 % quantile of χ²₁: the one-sided 95 % limit
-_FARTHEST = 1e4  # in ranges of the sample; beyond it the likelihood is flat and the distribution a Gumbel's
 
 
 @final
@@ -41,7 +41,7 @@ def fit(x: Array) -> ReverseWeibull:
     flat = spread <= 1e-12 * np.abs(top)
     unit = np.where(flat[:, None], np.linspace(0, 1, x.shape[1]), (top[:, None] - x) / np.where(flat, 1.0, spread)[:, None])
 
-    offsets = np.concatenate([[0.0], np.geomspace(1e-6, _FARTHEST, 121)])
+    offsets = np.concatenate([[0.0], np.geomspace(1e-6, THRESHOLDS.farthest_end, 121)])
     grid = np.broadcast_to(offsets, (len(x), len(offsets)))
     likelihood = _profile(unit, grid)[0]
     best = _refine(unit, grid, likelihood)

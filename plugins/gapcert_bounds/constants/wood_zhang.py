@@ -9,13 +9,12 @@ import numpy.typing as npt
 
 from gapcert import Array, UsageError
 from gapcert.plugin import LipschitzBound, LipschitzEstimator, LipschitzProblem
+from gapcert_bounds.thresholds import THRESHOLDS
 
 from . import weibull
 from .bends import curvatures
 from .slopes import Close, inert, uniform
 from .sweep import Curvature, estimate
-
-_FARTHEST = 2.0  # times the largest slope: maxima whose fitted end lies beyond show no end at all
 
 
 @final
@@ -73,7 +72,7 @@ class WoodZhang(LipschitzEstimator):
 
         maxima = np.stack([part.max(axis=0) for part in np.array_split(slope, self.batches)], axis=1)
         fit = weibull.fit(maxima)
-        location = np.minimum(fit.location, _FARTHEST * seen)
+        location = np.minimum(fit.location, THRESHOLDS.farthest_slope * seen)
         estimated = np.where(still, close.hidden(noise), np.maximum(location, seen) * self.safety)
         report = {
             "inert": still.tolist(),

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from gapcert import Array, Domain, GapFunction, Interval, Undecided, UsageError
 from gapcert.plugin import GapFamily, GapProblem, Samples
+from gapcert_bounds.thresholds import THRESHOLDS
 from gapcert_functions import Expression, Term, WeightedSum, band, dominate, weighted
 
 from .terms import bounded
@@ -19,11 +20,6 @@ Terms = Sequence[Term | Expression]
 
 _EPS = float(np.finfo(np.float64).eps)
 _CHUNK = 1 << 14
-_ROUNDS = 40
-_DROPPED = 1e-8
-_TABLE = 4096  # cells of the default table of shifts, at most
-_ASKED = 4096  # points that the band is asked at
-_ENOUGH = 1e-7  # of the largest residual; what is left is repaired by an exact shift
 
 
 @final
@@ -106,11 +102,11 @@ class Basis(GapFamily):
 
     def _dominating(self, problem: GapProblem) -> GapFunction:
         domain, nz = problem.domain, len(problem.domain.low)
-        counts = tuple(self.cells or (max(1, min(8, int(_TABLE ** (1 / nz)))),) * nz)
+        counts = tuple(self.cells or (max(1, min(8, int(THRESHOLDS.shift_cells ** (1 / nz)))),) * nz)
         if len(counts) != nz:
             raise UsageError(f"gap.cells: found {list(counts)}; expected one number per axis, that is {nz}")
         terms = bounded(self.functions, domain)
-        z = domain.draw(_ASKED, np.random.default_rng([problem.seed, 0xBA515]))
+        z = domain.draw(THRESHOLDS.asked_points, np.random.default_rng([problem.seed, 0xBA515]))
         p, (low, high) = problem.predictor(z), band(problem).interval(z)
         lower, upper = (
             WeightedSum(tuple(terms), -_above(terms, z, p - low)),
@@ -126,7 +122,7 @@ def _above(terms: Terms, z: Array, target: Array) -> Array:
     units = np.maximum(np.abs(target).max(axis=0), np.finfo(float).tiny)
     scaled = matrix / sizes
     solved = [_solve(scaled, t / unit, scaled.mean(axis=0)) for t, unit in zip(target.T, units, strict=True)]
-    kept = np.array([np.where(np.abs(v) < _DROPPED, 0.0, v) for v in solved])
+    kept = np.array([np.where(np.abs(v) < THRESHOLDS.dropped_weight, 0.0, v) for v in solved])
     return np.asarray(kept * (units[:, None] / sizes))
 
 
@@ -175,13 +171,13 @@ def scenario(terms: Terms, samples: Samples, domain: Domain, radius: float, seed
     active = [_extremes(samples, i, seed) for i in range(len(units))]
     scaled = np.zeros((len(units), len(terms)))
     pending = set(range(len(units)))
-    for _ in range(_ROUNDS):
+    for _ in range(THRESHOLDS.exchange_rounds):
         for i in pending:
             z = samples.z[active[i]]
             matrix = np.stack([t.value(z) for t in terms], axis=1) / sizes
             solved = _solve(matrix, np.abs(samples.r[active[i], i]) / units[i], cost, slopes)
             # What is left of a function that the solver dropped.
-            scaled[i] = np.where(np.abs(solved) < _DROPPED, 0.0, solved)
+            scaled[i] = np.where(np.abs(solved) < THRESHOLDS.dropped_weight, 0.0, solved)
         worst = _violated(terms, scaled * (units[:, None] / sizes), samples, units)
         pending = {i for i in pending if len(worst[i])}
         if not pending:
@@ -206,7 +202,7 @@ def _violated(terms: Terms, weights: Array, samples: Samples, units: Array) -> l
         missing = (np.abs(samples.r[c]) - weighted(terms, weights, samples.z[c])) / units
         for i in range(len(units)):
             top = np.argpartition(missing[:, i], -min(2, len(missing)))[-min(2, len(missing)) :]
-            rows[i].append(c.start + top[missing[top, i] > _ENOUGH])
+            rows[i].append(c.start + top[missing[top, i] > THRESHOLDS.exchange_error])
     return [np.concatenate(r) for r in rows]
 
 

@@ -9,11 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array
+from gapcert_bounds.thresholds import THRESHOLDS
 
 _BLOCK = 1 << 15  # entries of each working array: they stay in the second-level cache
-_GROUP = 256
-_DIRECT = 1024
-_CONES, _NEAR = 8, 1e-3  # that join a mean, at most; and of what a cone moves over the box: near enough
 _EPS = float(np.finfo(np.float64).eps)
 
 
@@ -106,8 +104,8 @@ class Cones:
         first = self.lowest(i, sign, centre)
         g, at = ends(rows, first)
         top = g + at.max(axis=0).sum(axis=1)
-        near, low = _NEAR * h @ self._lipschitz[i], np.full(len(rows), -np.inf)
-        for step in range(_CONES):
+        near, low = THRESHOLDS.mean_near * h @ self._lipschitz[i], np.full(len(rows), -np.inf)
+        for step in range(THRESHOLDS.mean_cones):
             rise = at[1] - at[0]
             corner = np.where(rise == 0, (-1) ** step, np.sign(rise))
             k = self.lowest(i, sign, centre[rows] + corner * h[rows])
@@ -182,14 +180,14 @@ class Cones:
 
         Of few points no groups are made, as nothing would be won.
         """
-        if len(z) < _DIRECT:
+        if len(z) < THRESHOLDS.direct_samples:
             return np.arange(len(z)), np.zeros(0, dtype=np.intp)
         low, width = z.min(axis=0), np.ptp(z, axis=0)
         weight = self._lipschitz * width
         total = weight.sum(axis=1, keepdims=True)
         weight = np.divide(weight, total, out=np.zeros_like(weight), where=total > 0).max(axis=0)
         counts = np.ones(z.shape[1], dtype=np.int64)
-        target = min(len(z) // _GROUP, 1 << 15)
+        target = min(len(z) // THRESHOLDS.grouped_samples, 1 << 15)
         while counts.prod() < target and (weight / counts).max() > 0:
             counts[np.argmax(weight / counts)] *= 2
         cell = np.zeros(len(z), dtype=np.uint16)

@@ -10,9 +10,7 @@ import numpy.typing as npt
 
 from gapcert import Array, Domain, Interval, UsageError
 from gapcert.plugin import Predictor, Samples, cells, cut, interpolate, ranges, rounding, slopes
-
-_NODES = 1_000
-_FITTED = 20_000
+from gapcert_bounds.thresholds import THRESHOLDS
 
 
 @final
@@ -42,7 +40,7 @@ class MultilinearPredictor(Predictor):
         distinct = [len(np.unique(column)) for column in samples.z.T]
         for most in (3, 2):
             counts = [min(most, n) for n in distinct]
-            if np.prod(counts) <= min(len(samples), _NODES):
+            if np.prod(counts) <= min(len(samples), THRESHOLDS.predictor_nodes):
                 break
         else:
             raise UsageError(
@@ -52,7 +50,7 @@ class MultilinearPredictor(Predictor):
         ends = zip(domain.low, domain.high, counts, samples.z.T, strict=True)
         axes = tuple(np.linspace(low, high, n) if n > 1 else z[:1].copy() for low, high, n, z in ends)
         size = int(np.prod(counts))
-        pick = np.linspace(0, len(samples) - 1, min(len(samples), _FITTED)).astype(int)
+        pick = np.linspace(0, len(samples) - 1, min(len(samples), THRESHOLDS.predictor_samples)).astype(int)
         design = interpolate(axes, np.eye(size).reshape(*counts, size), samples.z[pick])
         values = np.linalg.lstsq(design, samples.r[pick], rcond=None)[0]
         return cls(axes, np.ascontiguousarray(values.reshape(*counts, -1)))

@@ -6,7 +6,7 @@ import numpy as np
 
 from gapcert.plugin import Array, GapFunction, Interval, Predictor
 
-_DRAWN, _STEPS = 24, 24
+_DRAWN, _STEPS = 24, 24  # points of each box to begin with, and steps from them; chosen, not measured
 
 
 def reached(

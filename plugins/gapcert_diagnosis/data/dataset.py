@@ -12,14 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.plugin import Array, Hold, Model, Recording, StateSpec, UsageError
+from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_recordings import JITTER, Log, Piece, pieces
 
-HISTORY = 0.1  # s of input before a window that effects with memory may look back on
-UNEVEN = 0.05  # of the period: how far the median of uneven steps may be from the model's
 _HOLDS: tuple[Hold, ...] = ("zero", "first")
-QUIETEST = 1e-5  # of a channel's spread: the least noise floor
-FEWEST = 8  # samples in a window: fewer are lost in its free start
-SEEN = 0.5  # least share of a window's values that must be there
 
 
 @final
@@ -89,7 +85,7 @@ class Dataset:
             tuple(p.means(1, "zero") for p in kept),
             tuple(_states(model, channels, p) for p in kept),
             # Data without noise would otherwise ask the model for more digits than any integrator has.
-            np.maximum(floor, QUIETEST * spread),
+            np.maximum(floor, THRESHOLDS.least_floor * spread),
             spread,
             tuple(p.weight for p in kept),
             tuple(p.offset for p in kept),
@@ -102,7 +98,7 @@ class Dataset:
     @property
     def history(self) -> int:
         """Samples of input kept before every window."""
-        return math.ceil(HISTORY / self.period - 1e-6)
+        return math.ceil(THRESHOLDS.input_history / self.period - 1e-6)
 
     @property
     def past(self) -> int:
@@ -124,7 +120,7 @@ class Dataset:
     @property
     def exact(self) -> bool:
         """Is there no noise, as in what a simulator says?"""
-        return bool((self.sigma <= (1 + 1e-9) * QUIETEST * self.spread).all())
+        return bool((self.sigma <= (1 + 1e-9) * THRESHOLDS.least_floor * self.spread).all())
 
     def with_hold(self, hold: Hold | None) -> Dataset:
         """The same data with the input held in a given way."""
@@ -135,7 +131,7 @@ class Dataset:
 
     def brief(self, seconds: float) -> int:
         """Samples of a window that is to be short, but long enough to say something."""
-        return max(FEWEST, self.samples(seconds))
+        return max(THRESHOLDS.window_samples, self.samples(seconds))
 
     def first(self, piece: int) -> int:
         """The first sample of a piece at which a window may begin."""
@@ -151,7 +147,7 @@ class Dataset:
             starts = first + length * np.arange(count) if stride is None else np.arange(first, last + 1, stride)
             for s in starts.tolist():
                 share = self.weights[i][s : s + length].mean(axis=0)
-                parts += [(i, s)] if share.mean() >= SEEN and share.min() >= SEEN / 2 else []
+                parts += [(i, s)] if share.mean() >= THRESHOLDS.seen_share and share.min() >= THRESHOLDS.seen_share / 2 else []
         if not parts:
             longest = max(map(len, self.outputs)) * self.period
             need, before, window = ((n * self.period) for n in (length + self.history, self.history, length))
@@ -159,7 +155,8 @@ class Dataset:
                 there = np.average([w.mean(axis=0) for w in self.weights], axis=0, weights=[len(w) for w in self.weights])
                 slowest = self.period * round(1 / max(float(there.min()), 1e-3))
                 raise UsageError(
-                    f"recording: too many values are missing; expected {100 * SEEN:g} % of each window of {window:.3g} s; "
+                    f"recording: too many values are missing; expected {100 * THRESHOLDS.seen_share:g} % of each window "
+                    f"of {window:.3g} s; "
                     f"where channels come at different rates, add the period of the slowest to the recording, "
                     f"every: {slowest:.3g} s"
                 )
@@ -316,7 +313,7 @@ def _period(model: Model, recording: Recording) -> tuple[float, int]:
     if repeat >= 1 and off <= JITTER * period:
         return period, repeat
     even = all(np.abs(np.diff(tr.t) / period - 1).max() <= JITTER for tr in recording.trajectories)
-    if repeat >= 1 and not even and off <= UNEVEN * period:
+    if repeat >= 1 and not even and off <= THRESHOLDS.uneven_period * period:
         return repeat * model.period, repeat
     steps = max(1, math.ceil(period / model.period - JITTER))
     raise UsageError(

@@ -6,12 +6,9 @@ import numpy as np
 
 from gapcert.plugin import Array, difference, rotated
 from gapcert_diagnosis.native.candidates import CONTACT, tried
+from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_engines import NativeModel
 
-LEAD = 0.12  # s, at most
-FEWEST = 3  # samples: a line through two of them tells nothing of its misfit
-ASTRAY = 10.0  # noise floors: what is further from a line meets something that the rollout does not
-SAME = 1e-3  # noise floors
 _PAIRS = (("position", "velocity"), ("rotation", "rate"))
 
 
@@ -35,7 +32,7 @@ def settled(model: NativeModel, sigma: Array, seen: Array, u: Array) -> Array:
         return start
     other = {p.name: values[0] for p in model.parameters if p.name in CONTACT and (values := tried(p))}
     rolled, touched = (m.rollout(start, u).x for m in (model, model.restated(other)))
-    aloft = np.all([g.error(rolled, touched) <= SAME * s for g, s in groups.values()], axis=0)
+    aloft = np.all([g.error(rolled, touched) <= THRESHOLDS.same_flight * s for g, s in groups.values()], axis=0)
     aloft = np.logical_and.accumulate(aloft, axis=1)
     now, moved = model.turned(start, back=False), np.zeros(len(start), dtype=bool)
     for (place, noise), (speed, spread) in pairs:
@@ -65,8 +62,8 @@ def _line(period: float, off: Array, ratio: float) -> tuple[Array, Array]:
         square = np.cumsum(off**2, axis=1) - y0**2 / n - wide * slope**2
         misfit = np.sum(square, axis=-1) / np.maximum(n[:, 0] - 2, 1)
         variance = np.maximum(misfit, 1.0) / wide[:, 0]
-    variance[:, : FEWEST - 1] = np.inf
-    variance[~(misfit <= ASTRAY**2)] = np.inf
+    variance[:, : THRESHOLDS.line_samples - 1] = np.inf
+    variance[~(misfit <= THRESHOLDS.line_misfit**2)] = np.inf
     rows, best = np.arange(len(off)), np.argmin(variance, axis=1)
     found = np.isfinite(variance[rows, best])[:, None]
     b = np.where(found, slope[rows, best] / (1 + variance[rows, best] * ratio**2)[:, None], 0.0)

@@ -6,22 +6,18 @@ import numpy as np
 
 from gapcert.plugin import Array, Model, Recording, Trajectory, UsageError
 from gapcert_diagnosis.fitting.fit import Fit
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .dataset import Windows
 
-PLAIN = 0.9  # correlation of two accounts of one motion that shows by how much they differ
-NEAR = 0.05  # how far their ratio may be from that of two units
-EASED = 8  # samples: the noise of a position is as large as its move from one to the next
 UNITS = {"ms": 1e3, "us": 1e6, "ns": 1e9, "min": 1 / 60, "h": 1 / 3600}  # how much too slow a motion is, if read in s
-MIXED = 0.2  # of the rows: a clock that is set back so often is none
-LOST, COARSE = 0.5, 50.0  # of a channel's spread; mean square in noise floors: a simulation so far off follows nothing
 
 
 def ordered(recording: Recording) -> None:
     """Refuses rows that are in no order of time."""
     for tr in recording.trajectories:
         step = np.diff(tr.t[np.isfinite(tr.t)])
-        if (back := int((step < 0).sum())) > MIXED * len(tr) and (step > 0).any():
+        if (back := int((step < 0).sum())) > THRESHOLDS.backward_rows * len(tr) and (step > 0).any():
             raise UsageError(
                 f"recording: trajectory '{tr.name}': time goes back after {back:,} of {len(tr):,} rows; "
                 "expected rows in the order of time; sort them, or name the column that tells trajectories apart, "
@@ -42,13 +38,13 @@ def agreeing(model: Model, recording: Recording) -> None:
             continue
         moved, said = (np.concatenate(one) for one in zip(*found, strict=True))
         size = np.sqrt(np.sum(moved**2) * np.sum(said**2))
-        if not size or np.sum(moved * said) < PLAIN * size:
+        if not size or np.sum(moved * said) < THRESHOLDS.motion_agreement * size:
             continue
         slower = float(np.sqrt(np.sum(said**2) / np.sum(moved**2)))
         ratio = float(f"{max(slower, 1 / slower):.2g}")
         times = f"about {ratio:,.0f} times {'slower' if slower > 1 else 'faster'}"
         for unit, factor in UNITS.items():
-            if abs(slower / factor - 1) < NEAR:
+            if abs(slower / factor - 1) < THRESHOLDS.unit_error:
                 raise UsageError(
                     f"recording: {q} moves {times} than {v} says, with samples {recording.period:.6g} s apart; "
                     f"expected one motion; is the time in {unit}? Then give the unit of that column, recording.units: "
@@ -64,18 +60,18 @@ def _moved(tr: Trajectory, q: str, v: str) -> tuple[Array, Array] | None:
         step = np.diff(tr.t)
         moved, said = np.diff(tr.channels[q]), step * (rate[1:] + rate[:-1]) / 2
     good = np.isfinite(moved) & np.isfinite(said) & (step > 0) & (step < 1.5 * tr.period) & (np.abs(moved) < np.pi)
-    return (_eased(moved[good]), _eased(said[good])) if good.sum() > EASED else None
+    return (_eased(moved[good]), _eased(said[good])) if good.sum() > THRESHOLDS.eased_steps else None
 
 
 def _eased(steps: Array) -> Array:
-    return np.convolve(steps, np.ones(EASED), mode="valid")
+    return np.convolve(steps, np.ones(THRESHOLDS.eased_steps), mode="valid")
 
 
 def lost(fitted: Fit, windows: Windows) -> bool:
     """Does a fit whose windows begin where they like follow none of the channels?"""
     m = windows.measured
     off = np.sqrt(fitted.chi) * m.sigma
-    return bool((off > LOST * m.spread).all() and fitted.chi.max() > COARSE)
+    return bool((off > THRESHOLDS.lost_spread * m.spread).all() and fitted.chi.max() > THRESHOLDS.lost_floor)
 
 
 def doubt(fitted: Fit, windows: Windows) -> tuple[str, ...]:

@@ -14,16 +14,11 @@ from gapcert_diagnosis.data.dataset import Dataset, Windows, flat
 from gapcert_diagnosis.fitting.fit import Fit, fit, nearby
 from gapcert_diagnosis.results import Experiment
 from gapcert_diagnosis.search.candidates import Causes
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .excitation import shapes
 
 LIMITS = ("diagnose", "experiment", "limits")  # where a spec says them
-ROOM = 1.0  # of its range in the data, by which an output may leave that range where no limit is given
-SMALLER = (1.0, 0.5, 0.25, 0.1)  # of the limits: sizes that are tried until the outputs stay within theirs
-PLAIN = 25.0  # expected fall in score that settles the matter
-NESTED = 0.1  # of the larger separation: below that, one rival copies the other
-FINAL = 2  # inputs that are judged with full fits of both logs
-ITERATIONS, BRIEF = 6, 3
 
 
 @final
@@ -70,7 +65,9 @@ class Limits:
             asked[name] = low, high
         u, y = np.concatenate(measured.inputs), np.concatenate(measured.outputs)
         inputs = {s.name: _range(np.append(u[:, i], np.zeros(len(u) // 100 + 1)), 0.0) for i, s in enumerate(model.inputs)}
-        outputs = {s.name: _range(y[:, i], ROOM, model.within.get(s.name)) for i, s in enumerate(measured.channels)}
+        outputs = {
+            s.name: _range(y[:, i], THRESHOLDS.output_room, model.within.get(s.name)) for i, s in enumerate(measured.channels)
+        }
         return cls({n: asked.get(n, r) for n, r in inputs.items()}, {n: asked.get(n, r) for n, r in outputs.items()}, seconds)
 
 
@@ -94,7 +91,9 @@ def design(
     allowed = _within(fits, shapes(limits.inputs, limits.seconds, measured, seed), measured, limits, 2 * length)
     trials = [_Trial(pair, allowed, measured, length) for pair in pairs]
     best = [t.best(t.table) for t in trials]
-    separable = tuple(name is not None and t.table[name].expected > PLAIN for t, name in zip(trials, best, strict=True))
+    separable = tuple(
+        name is not None and t.table[name].expected > THRESHOLDS.settled_fall for t, name in zip(trials, best, strict=True)
+    )
     if not any(separable):
         return None, separable
     able = [t for t, yes in zip(trials, separable, strict=True) if yes]
@@ -107,7 +106,7 @@ def design(
 def _common(trials: Sequence[_Trial]) -> str | None:
     """The input from which the pair that gains least gains most, judged by full fits."""
     names = [n for n in trials[0].table if all(n in t.table for t in trials)]
-    names = sorted(names, key=lambda n: -min(t.table[n].value for t in trials))[:FINAL]
+    names = sorted(names, key=lambda n: -min(t.table[n].value for t in trials))[: THRESHOLDS.judged_inputs]
     for t in trials:
         t.judge(names)
     return max(names, key=lambda n: min(t.table[n].value for t in trials), default=None)
@@ -145,7 +144,7 @@ class _Separation:
     @property
     def nested(self) -> bool:
         """Does one rival contain the other, so that it copies it everywhere?"""
-        return min(self.rms) < NESTED * max(self.rms)
+        return min(self.rms) < THRESHOLDS.nested_separation * max(self.rms)
 
     @property
     def expected(self) -> float:
@@ -158,7 +157,7 @@ class _Separation:
     @property
     def value(self) -> float:
         """What is gained whichever of the two is true."""
-        return NESTED**2 * max(self.falls) if self.nested else min(self.falls)
+        return THRESHOLDS.nested_separation**2 * max(self.falls) if self.nested else min(self.falls)
 
 
 @final
@@ -174,7 +173,7 @@ class _Trial:
             both = [_first_order(b, log.windows(length)) for b, log in zip((pair.there, pair.here), logs, strict=True) if log]
             if len(both) == 2:
                 self.table[name] = _Separation.of(u, both, pair)
-        self.judge(sorted(self.table, key=lambda n: -self.table[n].value)[:FINAL])
+        self.judge(sorted(self.table, key=lambda n: -self.table[n].value)[: THRESHOLDS.judged_inputs])
 
     def judge(self, names: Sequence[str]) -> None:
         """By full fits."""
@@ -200,7 +199,7 @@ def _within(
     middle = np.array([0.0 if a <= 0 <= b else (a + b) / 2 for a, b in limits.inputs.values()])
     longest: dict[str, Array] = {}
     worth: dict[str, float] = {}
-    for size in SMALLER:
+    for size in THRESHOLDS.input_sizes:
         names = [n for n in signals if worth.get(n, 0.0) < size * len(signals[n])]
         if not names:
             break
@@ -245,7 +244,7 @@ def _first_order(rival: Fit, windows: Windows) -> Array:
     The numbers cost what they cost on the data that they come from: δᵀ C⁻¹ δ.
     """
     h, theta, p, nx = rival.hypothesis, rival.theta, len(rival.theta), windows.start.shape[1]
-    start = fit(h.holding(theta), windows, iterations=BRIEF).start
+    start = fit(h.holding(theta), windows, iterations=THRESHOLDS.design_start_iterations).start
     thetas, starts, width = nearby(h, theta, start, h.step)
     m = windows.measured
     r = difference(m.channels, h.simulate(windows, thetas, starts), windows.y[None]) / m.sigma * windows.weight
@@ -264,7 +263,7 @@ def _copied(rival: Fit, measured: Dataset, log: Dataset | None, length: int) -> 
     assert log is not None
     both = joined(measured, log)
     windows = both.windows(length)
-    again = fit(rival.hypothesis, windows, theta=rival.theta, iterations=ITERATIONS)
+    again = fit(rival.hypothesis, windows, theta=rival.theta, iterations=THRESHOLDS.design_iterations)
     return again.residual[windows.place[:, 0] >= len(measured.outputs)]
 
 

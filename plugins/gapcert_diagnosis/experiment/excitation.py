@@ -8,20 +8,18 @@ import numpy as np
 
 from gapcert.plugin import Array
 from gapcert_diagnosis.data.dataset import Dataset
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
-SINES = 10
 BANDS = {"a slow swing": (0.08, 0.4), "a slow multisine": (0.2, 1.5), "a multisine": (0.3, 4.0)}
 FAST = {"a fast multisine": (3.0, 12.0), "a very fast multisine": (12.0, 30.0)}
-SMALL = 0.3
 BACK = ("a slow swing", "a slow multisine", "a multisine", "a fast multisine", "steps", "slow steps", "switching")
-NYQUIST = 0.4  # of the sampling frequency: nothing faster is played
 
 
 def shapes(limits: Mapping[str, tuple[float, float]], seconds: float, measured: Dataset, seed: int) -> dict[str, Array]:
     """Name → u (T, nu): every input at once, each with phases and levels of its own; frequencies in units of the motion's."""
     period, count = measured.period, measured.samples(seconds)
     t, beat = np.arange(count) * period, _beat(measured)
-    most = NYQUIST / period
+    most = THRESHOLDS.fastest_input / period
     low, high = (np.array([pair[i] for pair in limits.values()]) for i in (0, 1))
     middle, half = (low + high) / 2, (high - low) / 2
     rest = np.clip(0.0, low, high)
@@ -29,8 +27,8 @@ def shapes(limits: Mapping[str, tuple[float, float]], seconds: float, measured: 
 
     def sines(band: tuple[float, float]) -> Array:
         top = min(band[1] * beat, most)
-        frequencies = np.linspace(min(max(band[0] * beat, 1 / seconds), top), top, SINES)
-        phases = rng.uniform(0, 2 * np.pi, (SINES, len(low)))
+        frequencies = np.linspace(min(max(band[0] * beat, 1 / seconds), top), top, THRESHOLDS.multisine_lines)
+        phases = rng.uniform(0, 2 * np.pi, (THRESHOLDS.multisine_lines, len(low)))
         waves = np.sin(2 * np.pi * frequencies[:, None, None] * t[:, None] + phases[:, None]).sum(axis=0)
         return np.asarray(waves / np.abs(waves).max(axis=0))
 
@@ -52,7 +50,10 @@ def shapes(limits: Mapping[str, tuple[float, float]], seconds: float, measured: 
     }
     unit["a chirp"] = every(np.sin(2 * np.pi * (0.1 * beat * t + (turn - 0.1 * beat) * t**2 / (2 * seconds))))
     unit["a creeping ramp"] = every(1 - 4 * np.abs((t / seconds + 0.25) % 1 - 0.5))
-    unit |= {f"{name}, small": SMALL * unit[name] for name in ("a slow swing", "a multisine", "slow steps", "a creeping ramp")}
+    unit |= {
+        f"{name}, small": THRESHOLDS.small_input * unit[name]
+        for name in ("a slow swing", "a multisine", "slow steps", "a creeping ramp")
+    }
     # What drifts comes back: a double integrator ends at rest where it began.
     unit |= {f"{name}, there and back": _returning(unit[name]) for name in BACK}
     out = {name: middle + half * shape for name, shape in unit.items()}

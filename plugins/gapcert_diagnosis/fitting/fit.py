@@ -15,19 +15,13 @@ import numpy as np
 
 from gapcert.plugin import Array, UsageError, difference
 from gapcert_diagnosis.data.dataset import Windows
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
-from .gauss_newton import STEEPEST, Slopes, fall, reduced, squares, steps
+from .gauss_newton import Slopes, fall, reduced, squares, steps
 from .hypothesis import Hypothesis as Hypothesis
 from .hypothesis import nudges
 
 TRIALS = np.array([0.1, 1.0, 10.0, 100.0])
-BLOWN = 1e6
-WILDEST = 1e100  # noise floors: squares of what is further off overflow, and a simulation that is has blown up
-SMALL = 0.3  # a fall of Σ r² that is not worth another descent
-LEFT, LEFT_ROUGH = 0.01, 1e-4  # falls of Σ r² that no step is made for; as a part of it, where a law is plainly missing
-ROUNDS = 8
-RETRACED, AGAIN = 3, 3  # times that memories are carried along the fitted motion; least iterations after that
-LEAST, ROUGH = 0.5, 10.0  # noise floors: what counts as the floor; mean squares from which a law is plainly missing
 
 
 @final
@@ -75,7 +69,7 @@ class Fit:
         """χ (W, ny) of every window; less than the noise floor counts as the floor."""
         w, length, ny = self.residual.shape
         counts = np.full((w, ny), float(length)) if self.weight is None else np.sum(self.weight**2, axis=1)
-        return np.asarray(np.maximum(np.sum(self.residual**2, axis=1) / np.maximum(counts, 1), LEAST))
+        return np.asarray(np.maximum(np.sum(self.residual**2, axis=1) / np.maximum(counts, 1), THRESHOLDS.counted_floor))
 
     @cached_property
     def typical(self) -> Array:
@@ -85,7 +79,7 @@ class Fit:
     @property
     def rough(self) -> bool:
         """Is something left that is no noise? Then the worst windows say least about the rest."""
-        return bool(self.chi.max() > ROUGH)
+        return bool(self.chi.max() > THRESHOLDS.rough)
 
     def score(self, closest: Fit, robust: bool = False) -> float:
         """S = Σ_c κ_c n_c ln χ_c + prior + k ln n, with κ of the closest of the fits that are compared.
@@ -94,7 +88,7 @@ class Fit:
         """
         n = self.counts
         chi = self.typical if robust else self.chi
-        fit = float(np.sum(closest.whiteness * n * np.log(np.maximum(chi, LEAST))))
+        fit = float(np.sum(closest.whiteness * n * np.log(np.maximum(chi, THRESHOLDS.counted_floor))))
         return fit + self.prior + self.hypothesis.charged * math.log(max(float(n.max()), 1.0))
 
     def interval(self) -> Array:
@@ -135,11 +129,11 @@ def fit(
             )
     ends = _Ends.of(windows)
     here = _descended(h, windows, here, ends, iterations)
-    for _ in range(RETRACED if h.model.remembers else 0):
+    for _ in range(THRESHOLDS.retraced_memories if h.model.remembers else 0):
         if (again := _retraced(h, windows, here)) is None:
             break
         windows, here = again
-        here = _descended(h, windows, here, ends, max(AGAIN, iterations // 2))
+        here = _descended(h, windows, here, ends, max(THRESHOLDS.retraced_iterations, iterations // 2))
     temper = max(1.0, float(squares(here.residual).sum()) / ends.n)
     schur = reduced(h, here, temper, np.zeros(1))[0][0]
     size = here.width[: len(theta)]
@@ -148,7 +142,8 @@ def fit(
 
 
 def followed(h: Hypothesis, theta: Array, windows: Windows, start: Array | None = None) -> Fit:
-    """Other windows with the numbers of a fit held; the residual is BLOWN noise floors where the simulation blows up there.
+    """Other windows with the numbers of a fit held; the residual is `blown_residual` noise floors where the simulation blows up
+    there.
 
     start: of another fit of these windows; each window begins from there, where that is nearer than what was measured.
     """
@@ -159,7 +154,7 @@ def followed(h: Hypothesis, theta: Array, windows: Windows, start: Array | None 
     rows = np.argmin(left, axis=0), np.arange(len(windows))
     if _followable(r[rows]):
         return fit(fixed, windows, start=starts[rows])
-    lost, none = np.full(r.shape[1:], BLOWN), np.empty((0, 0))
+    lost, none = np.full(r.shape[1:], THRESHOLDS.blown_residual), np.empty((0, 0))
     return Fit(fixed, np.empty(0), windows.start, lost, 0.0, none, windows.weight, windows.place)
 
 
@@ -226,7 +221,7 @@ def _retraced(h: Hypothesis, windows: Windows, here: Slopes) -> tuple[Windows, S
     if not reached.all():
         again = h.led(again, here.theta, here.start, ~reached)
     r = _residual(h, again, here.theta[None], here.start[None])[0]
-    if not np.isfinite(r).all() or abs(np.sum(r**2) - np.sum(here.residual**2)) < SMALL:
+    if not np.isfinite(r).all() or abs(np.sum(r**2) - np.sum(here.residual**2)) < THRESHOLDS.small_fall:
         return None
     return again, _linearise(h, again, here.theta, here.start, r, here.near(h))
 
@@ -250,14 +245,16 @@ def _descend(h: Hypothesis, windows: Windows, here: Slopes, ends: _Ends, iterati
             continue
         damping, there = max(damping * TRIALS[best], 1e-9), (thetas[best], starts[best], trials[best])
         # A step that does what its slopes promise has found them hardly changed: new ones would promise about nothing more.
-        reached = abs(costs[best] - cost + fall(h, here, temper)) < LEFT * temper
+        reached = abs(costs[best] - cost + fall(h, here, temper)) < THRESHOLDS.step_fall * temper
         if reached or cost - costs[best] < float(ends.small(np.array(square))):
             return here.moved(*there), k + 1
         here = _linearise(h, windows, *there, here.near(h))
     return here, iterations
 
 
-def _settle(h: Hypothesis, windows: Windows, here: Slopes, ends: _Ends, rounds: int = ROUNDS) -> tuple[Slopes, float]:
+def _settle(
+    h: Hypothesis, windows: Windows, here: Slopes, ends: _Ends, rounds: int = THRESHOLDS.settling_rounds
+) -> tuple[Slopes, float]:
     """The starts alone, each window on its own: one that sticks or turns would hold up all others in a common step."""
     held, p = h.holding(here.theta), len(here.theta)
     known = held.remembering(windows, np.empty(0))
@@ -313,7 +310,7 @@ def slopes(fitted: Fit, windows: Windows) -> Array:
     thetas, starts, _ = nearby(h, fitted.theta, fitted.start, step)
     r = _residual(h, windows, thetas[: 1 + p], starts[: 1 + p])
     rows = (r[1:] - r[0]).reshape(p, len(windows), -1).transpose(1, 2, 0)
-    return np.asarray(np.where(np.isfinite(rows), np.clip(rows, -STEEPEST, STEEPEST), 0.0))
+    return np.asarray(np.where(np.isfinite(rows), np.clip(rows, -THRESHOLDS.steepest, THRESHOLDS.steepest), 0.0))
 
 
 @final
@@ -327,21 +324,25 @@ class _Ends:
     @classmethod
     def of(cls, windows: Windows) -> _Ends:
         """Data of a simulator are hit exactly in the end, however far off a fit begins."""
-        return cls(max(1.0, float(np.count_nonzero(windows.weight))), np.inf if windows.measured.exact else ROUGH)
+        return cls(max(1.0, float(np.count_nonzero(windows.weight))), np.inf if windows.measured.exact else THRESHOLDS.rough)
 
     def small(self, square: Array, share: float = 1.0) -> Array:
         """Falls of Σ r², of a share of the samples, that no step is made for."""
         n = share * self.n
-        return np.asarray(np.where(square > self.rough * n, LEFT_ROUGH * square, LEFT * np.maximum(1.0, square / n)))
+        return np.asarray(
+            np.where(
+                square > self.rough * n, THRESHOLDS.rough_step_fall * square, THRESHOLDS.step_fall * np.maximum(1.0, square / n)
+            )
+        )
 
     def enough(self, square: float) -> float:
         """A fall that is not worth another descent."""
-        return max(SMALL, float(self.small(np.array(square))))
+        return max(THRESHOLDS.small_fall, float(self.small(np.array(square))))
 
 
 def _followable(r: Array) -> bool:
     """Is a residual finite, and what is computed from it?"""
-    return bool(np.abs(r).max(initial=0.0) < WILDEST)
+    return bool(np.abs(r).max(initial=0.0) < THRESHOLDS.wildest_residual)
 
 
 def _residual(h: Hypothesis, windows: Windows, theta: Array, start: Array) -> Array:

@@ -9,10 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.plugin import Array
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .hypothesis import Hypothesis
-
-STEEPEST = 1e6  # noise floors; a sample that is further off, or that one difference step moves further, counts as this
 
 
 @final
@@ -37,13 +36,13 @@ class Slopes:
         with np.errstate(invalid="ignore"):
             rows[:, :-1] = (moved - r).reshape(len(moved), len(r), -1).swapaxes(0, 1)
         rows[:, -1] = r.reshape(len(r), -1)
-        if not np.abs(rows).max() <= STEEPEST:
-            rows = np.clip(np.where(np.isfinite(rows), rows, 0.0), -STEEPEST, STEEPEST)
+        if not np.abs(rows).max() <= THRESHOLDS.steepest:
+            rows = np.clip(np.where(np.isfinite(rows), rows, 0.0), -THRESHOLDS.steepest, THRESHOLDS.steepest)
         return cls(theta, start, r, rows[:, :-1], rows @ rows.swapaxes(1, 2), width)
 
     def moved(self, theta: Array, start: Array, residual: Array) -> Slopes:
         """At numbers so near that a step there gains nothing: the slopes are the same."""
-        flat, gram = np.clip(residual.reshape(len(residual), -1), -STEEPEST, STEEPEST), self.gram.copy()
+        flat, gram = residual.reshape(len(residual), -1).clip(-THRESHOLDS.steepest, THRESHOLDS.steepest), self.gram.copy()
         gram[:, :-1, -1] = gram[:, -1, :-1] = (self.rows @ flat[..., None])[..., 0]
         gram[:, -1, -1] = squares(flat)
         return replace(self, theta=theta, start=start, residual=residual, gram=gram)

@@ -11,12 +11,9 @@ import numpy.typing as npt
 
 from gapcert.plugin import Array, Model, difference
 from gapcert_diagnosis.data.dataset import Windows
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .memory_states import recalled
-
-NODES = 4  # of the polynomial between samples
-NUDGE = 1e-5  # of the root mean square of a state: how far starts are moved for their slopes
-SHOTS, SINGULAR = 3, 1e-3  # rounds and cut-off of shooting through the history of a window
 
 
 @final
@@ -96,7 +93,7 @@ class Hypothesis:
         hidden = recalled(self.model, part, self._values(theta[None], 1), 1)
         size = nudges(start)
         many = {n: np.tile(v, nx + 1) if np.ndim(v) else v for n, v in values.items()}
-        for _ in range(SHOTS):
+        for _ in range(THRESHOLDS.history_shots):
             tried = np.concatenate([before, *(before + size * e for e in np.eye(nx))])
             with np.errstate(all="ignore"):
                 moved = self.model.fast_rollout(tried, u, parameters=many, hidden=np.tile(hidden, (nx + 1, 1)), every=past)
@@ -105,7 +102,7 @@ class Hypothesis:
             miss = difference(self.model.states, start[rows], end[0])
             if not (np.isfinite(slope).all() and np.isfinite(miss).all()):
                 return windows
-            before = before + (np.linalg.pinv(slope, rcond=SINGULAR) @ miss[..., None])[..., 0]
+            before = before + (np.linalg.pinv(slope, rcond=THRESHOLDS.history_cutoff) @ miss[..., None])[..., 0]
         return windows.begun(before, rows)
 
     def remembering(self, windows: Windows, theta: Array) -> Windows:
@@ -129,7 +126,7 @@ class Hypothesis:
         return self.model.output(x, np.zeros((1, self.model.nu))) is x
 
 
-def nudges(x: Array, share: float = NUDGE) -> Array:
+def nudges(x: Array, share: float = THRESHOLDS.start_nudge) -> Array:
     """Difference steps (nx,) of states (…, nx)."""
     return np.asarray(share * np.maximum(np.sqrt(np.mean(x**2, axis=tuple(range(x.ndim - 1)))), 1e-3))
 
@@ -137,7 +134,7 @@ def nudges(x: Array, share: float = NUDGE) -> Array:
 def between(y: Array, ahead: Array) -> Array:
     """Values of signals y (b, W, L, ny) `ahead` samples after each (broadcast to y): cubic through the four nearest."""
     length = y.shape[2]
-    nodes = min(NODES, length)
+    nodes = min(THRESHOLDS.sample_nodes, length)
     at = np.arange(length)[:, None] + np.broadcast_to(ahead, y.shape)
     first = np.clip(np.floor(np.nan_to_num(at)) - (nodes // 2 - 1), 0, length - nodes)
     inside, base = at - first, first.astype(np.int64)

@@ -17,13 +17,11 @@ import numpy as np
 from gapcert.plugin import Array, Model, difference
 from gapcert_diagnosis.data.dataset import Windows, flat
 from gapcert_diagnosis.search.candidates import probe, velocity
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .fit import Fit
 from .hypothesis import nudges
 from .memory_states import recalled
-
-NUDGE = 1e-6  # of a state's size, for slopes along a fitted path
-COARSE = 0.01  # s
 
 
 @final
@@ -250,8 +248,13 @@ class Tangent:
         x = fitted.hypothesis.motion(windows, fitted.theta[None], fitted.start[None])
         u = windows.drive[:, m.past :][:, : x.shape[1]]
         at = flat(x[:, :: m.repeat]), flat(u[:, :: m.repeat])
-        shifted = model.output(np.repeat(at[0], nx, axis=0) + np.tile(NUDGE * np.eye(nx), (len(at[0]), 1)), at[1].repeat(nx, 0))
-        slope = difference(model.outputs, shifted.reshape(len(at[0]), nx, -1), model.output(*at)[:, None]) / NUDGE
+        shifted = model.output(
+            np.repeat(at[0], nx, axis=0) + np.tile(THRESHOLDS.tangent_nudge * np.eye(nx), (len(at[0]), 1)), at[1].repeat(nx, 0)
+        )
+        slope = (
+            difference(model.outputs, shifted.reshape(len(at[0]), nx, -1), model.output(*at)[:, None])
+            / THRESHOLDS.tangent_nudge
+        )
         observe = np.swapaxes(slope[..., m.columns] / m.sigma, 1, 2).reshape(*windows.y.shape, nx) * windows.weight[..., None]
         x, u = x[:, :-1], u[:, : x.shape[1] - 1]
         A = model.jacobian(flat(x), flat(u))[:, :, :nx].reshape(*x.shape, nx) if model.hidden else _slopes(model, x, u)
@@ -292,8 +295,9 @@ class Tangent:
         return self.linear.project(rows.copy().reshape(*rows.shape[:2], -1)).reshape(rows.shape)
 
     def coarse(self, rows: Array) -> Array:
-        """Means over COARSE s of rows (W, L·ny, K), for regressions; their squares still add up to what the rows carry."""
-        block = max(1, round(COARSE / self.windows.measured.period))
+        """Means over `regression_block` s of rows (W, L·ny, K), for regressions; their squares still add up to what the rows
+        carry."""
+        block = max(1, round(THRESHOLDS.regression_block / self.windows.measured.period))
         kept = in_blocks(rows.reshape(*self.windows.y.shape, -1), block).mean(axis=2) * np.sqrt(block)
         return np.asarray(kept.reshape(len(kept), -1, kept.shape[-1]))
 
@@ -324,7 +328,7 @@ class Tangent:
 
 def _slopes(model: Model, x: Array, u: Array) -> Array:
     """∂x⁺/∂x (W, S, nx, nx) along motions, by differences: derivatives of long expressions cost several times as much."""
-    nx, size = model.nx, nudges(x, NUDGE)
+    nx, size = model.nx, nudges(x, THRESHOLDS.tangent_nudge)
     moved = np.concatenate([x, *(x + size * e for e in np.eye(nx))])
     new = model.along(moved, np.tile(u, (nx + 1, 1, 1))).reshape(nx + 1, *x.shape)
     return np.asarray(np.moveaxis(difference(model.states, new[1:], new[:1]), 0, -1) / size)

@@ -14,8 +14,7 @@ import numpy.typing as npt
 
 from gapcert.plugin import Array, Model
 from gapcert_diagnosis.data.dataset import Dataset, Windows
-
-STRETCH = 1.0  # s of free motion before the model is put back onto the measured one
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
 
 def recalled(model: Model, windows: Windows, parameters: Mapping[str, Array | float], count: int) -> Array:
@@ -46,7 +45,8 @@ def _defaults(model: Model, count: int, t: Array) -> Array:
 @final
 @dataclass(frozen=True)
 class _Way:
-    """The measured motion of all pieces, onto which models are put back every STRETCH and at their stops (piece → samples).
+    """The measured motion of all pieces, onto which models are put back every `free_stretch` and at their stops (piece →
+    samples).
 
     rows: piece → the windows that begin in it. It is the same for every model and all its numbers.
     """
@@ -64,7 +64,7 @@ class _Way:
     def own(self) -> list[set[int]]:
         """The samples at which each piece is put back."""
         last = int(self.stops[self.pieces[0]].max())
-        every = {0, *range(0, last, self.measured.samples(STRETCH))}
+        every = {0, *range(0, last, self.measured.samples(THRESHOLDS.free_stretch))}
         return [every | set(self.stops[p].tolist()) for p in self.pieces]
 
     @cached_property

@@ -6,12 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from gapcert_diagnosis.data.dataset import FEWEST, Windows
+from gapcert_diagnosis.data.dataset import Windows
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .fit import Fit, fit
-
-LOST = 30.0  # times the median squared residual of the windows
-PARTS = (8, 4, 2, 1)  # of a window, in turn
 
 
 def rescued(fitted: Fit, windows: Windows) -> Fit:
@@ -21,13 +19,13 @@ def rescued(fitted: Fit, windows: Windows) -> Fit:
     another turn; over a short one it cannot.
     """
     energy = np.mean(fitted.residual**2, axis=(1, 2))
-    lost: Any = np.flatnonzero(energy > LOST * max(1.0, float(np.median(energy))))
+    lost: Any = np.flatnonzero(energy > THRESHOLDS.lost_window * max(1.0, float(np.median(energy))))
     if not len(lost):
         return fitted
     some, fixed = windows.take(lost), fitted.hypothesis.holding(fitted.theta)
     start = some.start
-    for part in PARTS:
-        head = some.head(max(FEWEST, windows.length // part))
+    for part in THRESHOLDS.restart_parts:
+        head = some.head(max(THRESHOLDS.window_samples, windows.length // part))
         start = fit(fixed, head, start=start).start
     starts = fitted.start.copy()
     starts[lost] = start

@@ -11,12 +11,9 @@ import numpy as np
 from gapcert.plugin import Array, UsageError, difference
 from gapcert_diagnosis.data.dataset import Dataset, Windows
 from gapcert_diagnosis.results import Gain
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .fit import Fit, followed
-
-LEADS, FEWEST = (0.03, 0.06, 0.12, 0.3), 8  # s, samples: before a rollout, where the model that is judged finds its start
-STARTS = 16
-RESAMPLES = 1000
 
 
 @final
@@ -30,9 +27,9 @@ class Stretches:
     _rolled: dict[int, tuple[Fit, Array, Array]] = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
-    def of(cls, held: Dataset, horizon: float, lead: float = LEADS[-1]) -> Stretches:
+    def of(cls, held: Dataset, horizon: float, lead: float = THRESHOLDS.rollout_leads[-1]) -> Stretches:
         """`lead` in s."""
-        length, lead = held.samples(horizon), max(FEWEST, held.samples(lead))
+        length, lead = held.samples(horizon), max(THRESHOLDS.lead_samples, held.samples(lead))
         longest = max(len(y) - held.first(i) for i, y in enumerate(held.outputs)) - lead - length
         if horizon <= 0 or longest < 0:
             used, left = (lead + (0 if held.since else held.history)) * held.period, max((longest + length) * held.period, 0.0)
@@ -41,7 +38,7 @@ class Stretches:
                 f"{left:.3g} s are left; expected a positive horizon up to that; shorten it or hold out more",
                 ("diagnose", "horizons"),
             )
-        return cls(horizon, lead, held.windows(lead + length, max(1, min(length // 2, longest // STARTS))))
+        return cls(horizon, lead, held.windows(lead + length, max(1, min(length // 2, longest // THRESHOLDS.rollout_starts))))
 
     def simulate(self, fitted: Fit) -> Array:
         """Outputs (W, H, ny) of free rollouts; each fit is rolled out once."""
@@ -83,7 +80,7 @@ class Stretches:
             groups, count = np.arange(len(w)), len(w)
         sums = np.stack([np.bincount(groups, column, count) for column in new.T], axis=-1)
         sizes = np.bincount(groups, minlength=count)
-        drawn = np.random.default_rng(seed).integers(count, size=(RESAMPLES, count))
+        drawn = np.random.default_rng(seed).integers(count, size=(THRESHOLDS.resamples, count))
         means = sums[drawn].sum(axis=1) / sizes[drawn].sum(axis=1)[:, None]
         low, high = np.sqrt(np.quantile(means, [0.025, 0.975], axis=0))
         rms = [np.sqrt(np.mean(a, axis=0)) for a in (old, new)]
@@ -106,11 +103,11 @@ def stretches(
 
 def _lead(seen: Dataset | None, horizon: float, fitted: Fit | None) -> float:
     if seen is None or fitted is None:
-        return LEADS[-1]
+        return THRESHOLDS.rollout_leads[-1]
     leads = {}
-    for lead in LEADS:
+    for lead in THRESHOLDS.rollout_leads:
         try:
             leads[lead] = Stretches.of(seen, horizon, lead).error(fitted)
         except UsageError:
             break  # too little was fitted for so long a horizon; what is held out may be longer
-    return min(leads, key=lambda k: leads[k]) if leads else LEADS[-1]
+    return min(leads, key=lambda k: leads[k]) if leads else THRESHOLDS.rollout_leads[-1]

@@ -10,13 +10,10 @@ import numpy as np
 
 from gapcert.plugin import Array, Model, registry
 from gapcert_diagnosis.data.dataset import Windows
+from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_engines import EngineModel
 
 from .fit import Fit, followed
-
-SHOWN = 0.5  # of what is left, as root mean squares: a change by half a step that shows
-FEW = 8  # windows that are simulated with half the step
-FAST = 0.5  # of a step times the fastest rate in rad/s: below, an integrator follows what it steps
 
 
 def built(section: Mapping[str, Any]) -> Model:
@@ -60,15 +57,15 @@ def coarse(last: Fit, windows: Windows) -> tuple[str, ...]:
     fine = None if windows.measured.exact else stepped(h.model, 2 * h.model.substeps)
     if fine is None:
         return ()
-    rows = np.unique(np.linspace(0, len(windows) - 1, min(FEW, len(windows))).round().astype(np.intp))
+    rows = np.unique(np.linspace(0, len(windows) - 1, min(THRESHOLDS.half_step_windows, len(windows))).round().astype(np.intp))
     part, start = windows.take(rows), last.start[rows]
     # One without a fast mode is off by its order alone; what it then makes of the motion is no friction.
-    if fastest(h.model, start, part.u[:, windows.measured.history]) < FAST:
+    if fastest(h.model, start, part.u[:, windows.measured.history]) < THRESHOLDS.fastest_mode:
         return ()
     own, other = (followed(one, np.empty(0), part, start).residual for one in (h, replace(h, model=fine)))
     left, moved = (np.sqrt(np.mean(r**2, axis=(0, 1))) for r in (own, other - own))
     worst = int(np.argmax(moved / np.maximum(left, 1.0)))
-    if moved[worst] <= SHOWN * max(left[worst], 1.0):
+    if moved[worst] <= THRESHOLDS.half_step_change * max(left[worst], 1.0):
         return ()
     m, model = windows.measured, h.model
     c, (by, rest) = m.channels[worst], (float(v[worst] * m.sigma[worst]) for v in (moved, left))

@@ -10,12 +10,9 @@ from typing import Any, final
 import numpy as np
 
 from gapcert.plugin import Parameter
+from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_engines import NativeModel
 
-FACTORS = (0.1, 0.2, 0.4, 0.75, 1.35, 2.5, 5.0)
-"""Of a stated value."""
-SHARES = (0.05, 0.2, 0.5)
-"""Of the scale of a number that is stated as 0."""
 SCALES = {"m/s^2": 2.0, "m": 0.02, "1/s": 1.0, "s": 0.02}
 _CONTACT = {"friction": ("contact-friction", "mu", "ground"), "ground": ("contact-friction", "mu", "ground"),
             "spinning_friction": ("contact-friction", "coefficient", "spinning"),
@@ -124,9 +121,9 @@ def _settings(model: NativeModel) -> list[NativeCandidate]:
 
 def tried(p: Parameter) -> tuple[float, ...]:
     if p.low >= 0 and p.value > 0:
-        found = [p.value * f for f in FACTORS]
+        found = [p.value * f for f in THRESHOLDS.engine_factors]
     else:
-        near = [s * _scale(p) for s in SHARES]
+        near = [s * _scale(p) for s in THRESHOLDS.engine_shares]
         found = [p.value + d for d in near] + ([p.value - d for d in near] if p.low < p.value else [])
     return tuple(sorted(v for v in found if p.low <= v <= p.high))
 

@@ -14,20 +14,13 @@ from gapcert.plugin import Array, Emit, Event, Model, Recording, UsageError, dif
 from gapcert_diagnosis.problem import Diagnoser, DiagnosisProblem
 from gapcert_diagnosis.results import Cause, Diagnosis, Estimate, Gain, Misfit, Rival, Verdict
 from gapcert_diagnosis.search.criterion import agreement
+from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_engines import NativeModel
 from gapcert_figures import Channel, DiagnosisFigure, Waterfall, called, state_playback
 
 from .candidates import NativeCandidate, native_candidates
 from .rollouts import ErrorStore, Motions, sensitivity
 from .stepwise import EngineSearch, NativeFit
-
-WINDOW = 0.2  # s
-FEWEST = 4  # trajectories, or pieces of some, on either side
-RESAMPLES = 1000
-TIE = 10.0  # z², below which two causes are not told apart
-LEFT = 2.0  # errors over those that noisy starts make: more is something left
-ENOUGH = 0.3  # of the held-out error: what causes explain, so that they are the answer
-UNSEEN, ALIKE, STEP = 1e-3, 0.95, 0.05  # noise floors; correlation; change of a parameter
 
 
 @final
@@ -57,7 +50,9 @@ def diagnose_native(model: NativeModel, problem: DiagnosisProblem) -> Diagnosis:
     entries = native_candidates(model, {e.name for e in problem.effects}, simulated=bool(parts[0].noise))
     store = ErrorStore(None if problem.folder is None else problem.folder / "scores")
     lap("evidence")
-    search = EngineSearch(model, fitted, entries, sorted({problem.window or WINDOW, max(horizons)}), store, tell)
+    search = EngineSearch(
+        model, fitted, entries, sorted({problem.window or THRESHOLDS.contact_window, max(horizons)}), store, tell
+    )
     best = search.select()
     lap("search")
     judge = _Judge(held, tuple(sorted(horizons)), store)
@@ -69,7 +64,7 @@ def diagnose_native(model: NativeModel, problem: DiagnosisProblem) -> Diagnosis:
     visible = _visible(search, best)
     lap("leftover")
     verdict = _verdict(causes, left, judge.error(model), judge.error(best.model))
-    if causes and (bad := {n: v for n, v in left.items() if v > LEFT}):
+    if causes and (bad := {n: v for n, v in left.items() if v > THRESHOLDS.left_errors}):
         worst = max(bad, key=lambda n: bad[n])
         text = f"inadequate: over {min(search.horizons):g} s, errors of {worst} are still {bad[worst]:.2g} times those of noise"
         causes = (*causes[:-1], replace(causes[-1], flags=(*causes[-1].flags, text)))
@@ -92,9 +87,10 @@ def diagnose_native(model: NativeModel, problem: DiagnosisProblem) -> Diagnosis:
 
 def _checked(model: NativeModel, parts: tuple[Recording, Recording]) -> tuple[Motions, Motions]:
     fitted, held = (Motions.of(model, part) for part in parts)
-    if min(len(fitted), len(held)) < FEWEST:
+    if min(len(fitted), len(held)) < THRESHOLDS.contact_trajectories:
         raise UsageError(
-            f"diagnose: {len(fitted)} trajectories are fitted and {len(held)} held out; expected at least {FEWEST} on either "
+            f"diagnose: {len(fitted)} trajectories are fitted and {len(held)} held out; expected at least "
+            f"{THRESHOLDS.contact_trajectories} on either "
             f"side, since one trajectory is one voice; record more, or cut long ones",
             ("diagnose", "hold_out"),
         )
@@ -132,7 +128,7 @@ class _Judge:
         """Mean errors, with intervals from trajectories drawn again."""
         old, new = self.errors(before)[..., 1], self.errors(after)[..., 1]
         n = len(new)
-        drawn = np.random.default_rng(seed).integers(n, size=(RESAMPLES, n))
+        drawn = np.random.default_rng(seed).integers(n, size=(THRESHOLDS.resamples, n))
         low, high = np.quantile(new[drawn].mean(axis=1), [0.025, 0.975], axis=0)
         out: dict[str, dict[str, Gain]] = {}
         for h, horizon in enumerate(self.horizons):
@@ -176,8 +172,12 @@ def _estimates(best: NativeFit, c: NativeCandidate, seed: int) -> dict[str, Esti
 
 def _verdict(causes: tuple[Cause, ...], left: Mapping[str, float], before: float, after: float) -> Verdict:
     if causes:
-        return "causes" if after < (1 - ENOUGH) * before or max(left.values()) <= LEFT else "unexplained"
-    return "nothing" if max(left.values()) <= LEFT else "unexplained"
+        return (
+            "causes"
+            if after < (1 - THRESHOLDS.enough_explained) * before or max(left.values()) <= THRESHOLDS.left_errors
+            else "unexplained"
+        )
+    return "nothing" if max(left.values()) <= THRESHOLDS.left_errors else "unexplained"
 
 
 def _misfits(search: EngineSearch, best: NativeFit) -> dict[str, Misfit]:
@@ -193,7 +193,7 @@ def _ties(search: EngineSearch, best: NativeFit) -> tuple[tuple[tuple[str, str],
     out = []
     for c in best.causes:
         r = search.rivals.get(c.key)
-        if r is not None and len(r.causes) <= len(best.causes) and _margin(search, best, r) < TIE:
+        if r is not None and len(r.causes) <= len(best.causes) and _margin(search, best, r) < THRESHOLDS.tie_z2:
             out.append(tuple(k.key for k in (*(k for k in best.causes if k is not c), r.causes[-1])))
     return tuple(out)
 
@@ -236,18 +236,18 @@ def _visible(search: EngineSearch, best: NativeFit) -> dict[str, Any]:
     for n in search.entries:
         if n.parameter is not None and n.option is None:
             value = now[n.native]
-            new = value * (1 + STEP) if value else n.back(n.to(value) + STEP)
+            new = value * (1 + THRESHOLDS.probe_step) if value else n.back(n.to(value) + THRESHOLDS.probe_step)
             changes[n.native] = best.model.restated({n.native: min(max(new, n.parameter.low), n.parameter.high)})
     moved = sensitivity(search.few, best.model, changes, min(search.horizons))
     size = {n: float(np.sqrt(np.mean(v**2))) for n, v in moved.items()}
-    seen = {n: v for n, v in size.items() if v > UNSEEN}
+    seen = {n: v for n, v in size.items() if v > THRESHOLDS.unseen_effect}
     alike = []
     for a, b in itertools.combinations(seen, 2):
         together = float(moved[a] @ moved[b]) / math.sqrt(float(moved[a] @ moved[a]) * float(moved[b] @ moved[b]))
-        if abs(together) > ALIKE:
+        if abs(together) > THRESHOLDS.alike_numbers:
             alike.append(f"{a} and {b}")
     alike += [f"{a} and {b}" for a, twins in search.twins.items() for b in twins]
-    hidden = sorted(n for n, v in size.items() if v <= UNSEEN)
+    hidden = sorted(n for n, v in size.items() if v <= THRESHOLDS.unseen_effect)
     out: dict[str, Any] = {"native parameters that show (noise floors per 5 %)": {n: round(v, 3) for n, v in seen.items()}}
     out |= {"native parameters that these data do not show": hidden} if hidden else {}
     return out | ({"native parameters that these data do not tell apart": alike} if alike else {})

@@ -10,12 +10,7 @@ from typing import final
 import numpy as np
 
 from gapcert.plugin import Array
-
-RESAMPLES = 1000
-SMALLEST, LARGEST = 0.02, 0.3  # radius, in the coordinates of candidates
-SHRINK = 2.5
-FLAT = 1e-6  # of the largest curvature
-WORSE = 0.02  # nats
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
 
 @final
@@ -53,14 +48,17 @@ class Surface:
         values, vectors = np.linalg.eigh(hessian)
         slope = vectors.T @ gradient
         # Along a direction without a minimum, the way down is taken to the end of what was tried.
-        step = np.where(values > FLAT * max(np.abs(values).max(), 1e-300), -slope / np.where(values > 0, values, 1.0),
-                        -3.0 * np.sign(slope))  # fmt: skip
+        step = np.where(
+            values > THRESHOLDS.flat_curvature * max(np.abs(values).max(), 1e-300),
+            -slope / np.where(values > 0, values, 1.0),
+            -3.0 * np.sign(slope),
+        )
         return np.asarray(np.clip(vectors @ np.clip(step, -3.0, 3.0), -3.0, 3.0))
 
     def bootstrap(self, seed: int) -> Array:
-        """Minima (RESAMPLES, p) of surfaces whose trajectories are drawn again."""
+        """Minima (`resamples`, p) of surfaces whose trajectories are drawn again."""
         n = len(self.coefficients)
-        drawn = np.random.default_rng(seed).multinomial(n, np.full(n, 1 / n), RESAMPLES)
+        drawn = np.random.default_rng(seed).multinomial(n, np.full(n, 1 / n), THRESHOLDS.resamples)
         return self.minimum(drawn.astype(np.float64))
 
 
@@ -98,7 +96,7 @@ def descend(
     minimum so well is the last.
     """
     low, high = (np.array(side) for side in zip(*bounds, strict=True))
-    centre, size = np.clip(start, low, high), np.minimum(np.full(len(start), radius), LARGEST)
+    centre, size = np.clip(start, low, high), np.minimum(np.full(len(start), radius), THRESHOLDS.largest_radius)
     plan = design(len(start), lean=enough is not None)
     best, left = centre, rounds
     for _ in range(2 * rounds):
@@ -107,9 +105,9 @@ def descend(
         surface = Surface.of(points, scores, centre, size)
         new, tried = np.clip(surface.minimum(), low, high), scores.mean(axis=1)
         mean = float(evaluate(new).mean())
-        if mean > tried.min() + WORSE:
+        if mean > tried.min() + THRESHOLDS.worse_centre:
             centre = best = points[tried.argmin()]
-            size = np.maximum(size / SHRINK, SMALLEST)
+            size = np.maximum(size / THRESHOLDS.radius_shrink, THRESHOLDS.least_radius)
             continue
         left -= 1
         inside = (np.abs(new - centre) <= size).all()
@@ -118,5 +116,5 @@ def descend(
             break
         if inside:
             width = np.std(surface.bootstrap(0), axis=0)
-            size = np.clip(np.maximum(size / SHRINK, 2 * width), SMALLEST, size)
+            size = np.clip(np.maximum(size / THRESHOLDS.radius_shrink, 2 * width), THRESHOLDS.least_radius, size)
     return best, surface

@@ -15,13 +15,10 @@ from typing import final
 import numpy as np
 
 from gapcert.plugin import DAMAGE, Array, Recording, UsageError, difference, npz_bytes, write_atomic
-from gapcert_diagnosis.data.initial_states import LEAD, flying, settled
+from gapcert_diagnosis.data.initial_states import flying, settled
 from gapcert_diagnosis.search.candidates import once
+from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_engines import Group, NativeModel
-
-UNEVEN = 0.01  # of the period: how far a step of time may be off
-LEGS = 8  # lengths at which rollouts are cut, so that those that have ended are not rolled on
-LOST = 1e3  # spreads: the error of a rollout that the engine gave up on
 
 
 @final
@@ -73,7 +70,7 @@ class Motions:
         states, inputs, times = [], [], []
         for tr in recording.trajectories:
             steps = np.diff(tr.t)
-            if not np.allclose(steps, model.period, rtol=0, atol=UNEVEN * model.period):
+            if not np.allclose(steps, model.period, rtol=0, atol=THRESHOLDS.uneven_step * model.period):
                 worst = float(steps[np.argmax(np.abs(steps - model.period))])
                 raise UsageError(
                     f"recording: trajectory '{tr.name}' has a step of {worst:.6g} s; expected {model.period:.6g} s, the "
@@ -127,7 +124,7 @@ class Motions:
         """(n, nx): the measured states, or what the flight from there says; for all hypotheses that fly alike the same."""
         if self.exact:
             return np.stack([self.states[i][s] for i, s, _ in pieces])
-        flight, most = flying(model, self.model), max(1, round(LEAD / self.model.period))
+        flight, most = flying(model, self.model), max(1, round(THRESHOLDS.start_lead / self.model.period))
         of = flight.digest()
         keys = [(of, self.order[i], s, min(steps, most)) for i, s, steps in pieces]
         new = {key: piece for key, piece in zip(keys, pieces, strict=True) if key not in self.known}
@@ -155,7 +152,9 @@ class Motions:
         for k, (i, s, steps) in enumerate(pieces):
             part = self.recent.begun(model, (i, s), x[k])[: steps + 1]
             out[k, : len(part)], begun[k] = part, len(part) - 1
-        legs = {int(q) for q in np.quantile(lengths, np.linspace(0, 1, LEGS + 1), method="nearest")} | set(begun.tolist())
+        legs = {int(q) for q in np.quantile(lengths, np.linspace(0, 1, THRESHOLDS.rollout_legs + 1), method="nearest")} | set(
+            begun.tolist()
+        )
         for done, leg in itertools.pairwise(sorted(legs | {0})):
             rows = order[(lengths > done) & (begun[order] <= done)]
             if not len(rows):
@@ -177,7 +176,7 @@ class Motions:
         try:
             pieces, out = self.rolled(model, horizon)
         except UsageError:  # the engine cannot follow this hypothesis
-            lost = LOST * self.spread
+            lost = THRESHOLDS.lost_rollout * self.spread
             return np.tile(np.stack([lost**2, lost, np.log(lost)], axis=-1), (len(self), 1, 1))
         return self.compared(pieces, out)
 

@@ -14,26 +14,12 @@ from gapcert.plugin import Array, GapcertError
 from gapcert_diagnosis.search.candidates import once
 from gapcert_diagnosis.search.criterion import agreement
 from gapcert_diagnosis.search.selection import drop, forward
+from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_engines import NativeModel
 
 from .candidates import NativeCandidate
-from .response_surface import SMALLEST, Surface, descend
+from .response_surface import Surface, descend
 from .rollouts import ErrorStore, Motions, score
-
-LOOK, FEW = 8, 24  # trajectories on which all values are tried, and on which the best of some candidates
-SEEN = 4  # candidates that are screened on the larger number
-SHIFTS = (-0.2, 0.0, 0.2)  # of the last number, in its coordinate: it may have stood in for a setting
-SHORTLIST = 3  # candidates that get a fit after screening
-FIRST, FULL = 2, 2  # rounds of a fit to some and to all trajectories
-FALL = 0.02  # nats: least mean fall of the score; 2 % of all errors
-HOPE = FALL / 4  # before the other numbers have followed: less is not looked into further
-EXACT = FALL / 2  # how well a surface has to tell the score at its minimum
-SHARE = 0.01  # least fall of the error over the longest horizon, whose square counts wild motions in full
-CHANCE = 0.01  # that any of the candidates is named without a reason
-NEAR = 10.0  # z²: nearer ones are both fitted to all trajectories
-PLAIN = 0.2  # nats: what needs no further trajectories
-SAME = 1e-9  # nats: scores that are one and the same
-AHEAD = 0.25  # first radius of a fit
 
 Causes = tuple[NativeCandidate, ...]
 
@@ -72,13 +58,13 @@ class EngineSearch:
     ) -> None:
         self.model, self.motions, self.entries = model, motions, tuple(entries)
         self.horizons, self.store, self.tell = tuple(horizons), store, tell
-        self.few, self.look = motions.some(FEW), motions.some(LOOK)
+        self.few, self.look = motions.some(THRESHOLDS.few_trajectories), motions.some(THRESHOLDS.look_trajectories)
         self.twins: dict[str, list[str]] = {}
         self.negligible: dict[tuple[str, str], float] = {}
         self.rivals: dict[tuple[str, str], NativeFit] = {}
         self.fits: dict[frozenset[str], NativeFit] = {}
         self.nothing = NativeFit((), model)
-        self.margin = norm.isf(CHANCE / max(1, len(self.entries)))
+        self.margin = norm.isf(THRESHOLDS.named_by_chance / max(1, len(self.entries)))
 
     def _best(self) -> dict[str, Any]:
         """The set with the least mean score so far: what one sees meanwhile."""
@@ -110,10 +96,12 @@ class EngineSearch:
         """The best set with one cause more; the next best becomes its rival."""
         tried = self.shortlist(parent)
         few = [self.scores(f.model, self.few) for f in tried]
-        near = [f for f, s in zip(tried[:2], few, strict=False) if f is tried[0] or agreement(s - few[0]) ** 2 < NEAR]
+        near = [
+            f for f, s in zip(tried[:2], few, strict=False) if f is tried[0] or agreement(s - few[0]) ** 2 < THRESHOLDS.near_z2
+        ]
         before = self.mean(parent.model)
-        hopeful = [f for f in near if before - self.mean(f.model) > HOPE]
-        full = self.rank([self.fit(f.causes, f, FULL) for f in hopeful])
+        hopeful = [f for f in near if before - self.mean(f.model) > THRESHOLDS.contact_hope]
+        full = self.rank([self.fit(f.causes, f, THRESHOLDS.full_rounds) for f in hopeful])
         for key in (f.causes[-1].key for f in full[:width]):
             others = [f for f in (*full[1:], *tried) if f.causes[-1].key != key]
             self.rivals |= {key: others[0]} if others else {}
@@ -125,9 +113,9 @@ class EngineSearch:
     def shortlist(self, best: NativeFit) -> list[NativeFit]:
         """Fits, to some of the trajectories, of the most promising candidates, best first."""
         before = self.mean(best.model, self.few)
-        seen = [(n, self._try(best, n, (value,), self.few)) for _, n, value in self._screen(best)[:SEEN]]
+        seen = [(n, self._try(best, n, (value,), self.few)) for _, n, value in self._screen(best)[: THRESHOLDS.seen_nominees]]
         screened = sorted(((s, n, value) for n, tried in seen for s, value in tried), key=lambda s: s[0])
-        picks = [s for s in screened if s[0] < before - HOPE][:SHORTLIST]
+        picks = [s for s in screened if s[0] < before - THRESHOLDS.contact_hope][: THRESHOLDS.fitted_nominees]
         out = [f for _, n, value in picks if not _tolerated(f := self._begin(best, n, value))]
         return sorted(out, key=lambda f: self.mean(f.model, self.few))
 
@@ -138,13 +126,15 @@ class EngineSearch:
         rows: dict[str, tuple[float, ...]] = {}
         for n in (n for n in self.entries if n.key not in {c.key for c in best.causes}):
             self.tell(f"{n.effect}: {n.label}")
-            tried = self._try(best, n, n.values or SHIFTS, self.look)
+            tried = self._try(best, n, n.values or THRESHOLDS.setting_shifts, self.look)
             rows[n.label] = tuple(s for s, _ in tried)
             if not tried or self._twin(n, rows, before):
                 continue
             least, value = min(tried, key=lambda t: t[0])
-            alike = any(e.key == n.key and n.option is not None and abs(s - least) < HOPE for s, e, _ in found)
-            if least < before - SAME and not alike:
+            alike = any(
+                e.key == n.key and n.option is not None and abs(s - least) < THRESHOLDS.contact_hope for s, e, _ in found
+            )
+            if least < before - THRESHOLDS.same_score and not alike:
                 found.append((least, n, value))
         return sorted(found, key=lambda s: s[0])
 
@@ -174,13 +164,13 @@ class EngineSearch:
     def _twin(self, n: NativeCandidate, rows: dict[str, tuple[float, ...]], before: float) -> bool:
         """Does a candidate do, value for value, what an earlier one of its effect does?"""
         row = np.array(rows[n.label])
-        if not len(row) or np.abs(row - before).max() < SAME:
+        if not len(row) or np.abs(row - before).max() < THRESHOLDS.same_score:
             return False
         for e in self.entries:
             if e.key == n.key and e.label != n.label and n.option is None and len(known := rows.get(e.label, ())) == len(row):
-                same = np.abs(np.array(known) - row) < SAME
+                same = np.abs(np.array(known) - row) < THRESHOLDS.same_score
                 # What only one of them can do (the smaller of two counts) leaves the other where it was.
-                if np.all(same) or (np.any(same) and np.all(same | (np.abs(row - before) < SAME))):
+                if np.all(same) or (np.any(same) and np.all(same | (np.abs(row - before) < THRESHOLDS.same_score))):
                     self.twins.setdefault(e.native, []).append(n.native)
                     return True
         return False
@@ -188,7 +178,7 @@ class EngineSearch:
     def _begin(self, best: NativeFit, n: NativeCandidate, value: float) -> NativeFit:
         ((_, start),) = self._variants(best, n, (value,))
         causes = (*best.causes, n)
-        return self.fit(causes, NativeFit(causes, start, surface=best.surface), FIRST, self.few)
+        return self.fit(causes, NativeFit(causes, start, surface=best.surface), THRESHOLDS.few_rounds, self.few)
 
     def fit(self, causes: Causes, start: NativeFit, rounds: int, motions: Motions | None = None) -> NativeFit:
         """All free numbers of the causes together, from where `start` has them; to all trajectories or to those given."""
@@ -203,11 +193,11 @@ class EngineSearch:
         same = start.causes == causes and len(start.z) == len(free)  # the point that was judged, to the last bit
         first = start.z if same else np.array([c.to(now[c.native]) for c in free])
         bounds = [_bounds(c) for c in free]
-        radius = np.full(len(free), AHEAD)
+        radius = np.full(len(free), THRESHOLDS.first_radius)
         if (s := start.surface) is not None:  # numbers that were known before come first
             known = s.radius if len(s.radius) <= len(free) else s.radius.max()
-            radius[: len(s.radius)] = np.clip(known, 2 * SMALLEST, AHEAD)
-        enough = None if start.surface is None else EXACT
+            radius[: len(s.radius)] = np.clip(known, 2 * THRESHOLDS.least_radius, THRESHOLDS.first_radius)
+        enough = None if start.surface is None else THRESHOLDS.surface_error
         z, surface = descend(
             lambda p: self.scores(_restated(start.model, free, p), motions), first, bounds, radius, rounds, enough
         )
@@ -217,9 +207,9 @@ class EngineSearch:
         """Do trajectories that the numbers were not fitted to agree, and is it worth a name?"""
         gained, share = self.gained(new, best)
         seen = agreement(gained) > self.margin
-        if seen and gained.mean() > 0 and not (gained.mean() > FALL and share > SHARE):
+        if seen and gained.mean() > 0 and not (gained.mean() > THRESHOLDS.contact_fall and share > THRESHOLDS.contact_share):
             self.negligible[new.causes[-1].key] = share
-        return bool(seen and gained.mean() > FALL and share > SHARE)
+        return bool(seen and gained.mean() > THRESHOLDS.contact_fall and share > THRESHOLDS.contact_share)
 
     def gained(self, new: NativeFit, old: NativeFit) -> tuple[Array, float]:
         """Fall of the score (trajectories,), and share of the error over the longest horizon.
@@ -241,7 +231,7 @@ class EngineSearch:
     def pays(self, found: NativeFit, rest: NativeFit) -> bool:
         """Is a set so much better than one that lacks a cause that some of the trajectories say enough, or do all agree?"""
         gained = self.scores(rest.model, self.few) - self.scores(found.model, self.few)
-        return bool(gained.mean() > PLAIN and agreement(gained) > self.margin) or self.outdoes(found, rest)
+        return bool(gained.mean() > THRESHOLDS.plain_fall and agreement(gained) > self.margin) or self.outdoes(found, rest)
 
     def without(self, found: NativeFit, cause: NativeCandidate) -> NativeFit:
         """The other causes alone, their numbers fitted again; settings alone have none."""
@@ -253,7 +243,7 @@ class EngineSearch:
             for k in rest:
                 model = model.set(k.option) if k.option is not None else model
         start = NativeFit(rest, model, surface=found.surface)
-        return start if rest and all(k.option is not None for k in rest) else self.fit(rest, start, FIRST)
+        return start if rest and all(k.option is not None for k in rest) else self.fit(rest, start, THRESHOLDS.few_rounds)
 
 
 def _free(causes: Causes) -> list[NativeCandidate]:

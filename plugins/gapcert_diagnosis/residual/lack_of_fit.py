@@ -23,21 +23,11 @@ from gapcert.plugin import Array
 from gapcert_diagnosis.data.dataset import flat
 from gapcert_diagnosis.fitting.fit import slopes
 from gapcert_diagnosis.fitting.linearised import Tangent, states
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .regression import features, input_features
 from .whiteness import noise
 
-SIGMAS = 5.0  # of the largest of some hundred scores
-NEW = 0.02  # share of c that starts and fitted numbers must leave
-JOINT = 1e-2  # of the largest singular value: directions of a kind that are nearly others of it
-LOST = 1e-6  # share of its square that starts must leave of a column, that products of what was made tell it to 1e-9
-SAME = 1e-6  # of the largest singular value: directions that fitted numbers share
-DRY = 0.005  # of the root mean square of a speed: where its sign turns
-LEVELS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 0.85, 0.95)  # quantiles of a speed
-PLACES = (0.0, 0.1, 0.25, 0.4, 0.5, 0.6, 0.75, 0.9, 1.0)  # quantiles of a position
-DECAYS = (0.003, 0.01, 0.03, 0.1, 0.2, 0.4, 0.8, 1.5)  # of the root mean square of a speed
-CUTS = (0.05, 0.1, 0.2, 0.4, 0.8, 1.2, 1.6)  # of the root mean square of an input
-HIGH = (0.15, 0.3, 0.5, 0.7, 0.85, 0.95)  # of its peak
 KINDS = {
     "static": "the present state and input",
     "periodic": "the position, again and again",
@@ -45,7 +35,6 @@ KINDS = {
     "input hysteresis": "how the input got where it is",
     "position memory": "how the position got where it is",
 }
-PEAK = 5.0  # times its root mean square, at which an effort counts no more
 
 
 @final
@@ -68,7 +57,7 @@ def lack(long: Tangent, short: Tangent, seed: int = 0) -> Lack | None:
     against = np.concatenate([long.free, *(a.reshape(*long.residual.shape, -1) for a in (gone, r.T))], axis=2)
     weighed = long.linear.adjoint(against)
     drawn = functools.cache(lambda: [_without(gone, n.reshape(len(n), -1)) for n in noise(long, short, seed)])
-    best, clearly = Lack("", "", SIGMAS), attrgetter("sigmas")
+    best, clearly = Lack("", "", THRESHOLDS.lack_sigmas), attrgetter("sigmas")
     for site in long.model.sites("coordinate"):
         forces = _Forces.of(long, site, *weighed)
         found = {**shared, **features(long, site), **_shapes(long, site)}
@@ -114,7 +103,7 @@ class _Columns:
             whole = np.diag(square).copy()
             square = square - gone.T @ gone
             left = np.diag(square)
-            which = np.flatnonzero(np.isfinite(whole) & (left > NEW**2 * whole))
+            which = np.flatnonzero(np.isfinite(whole) & (left > THRESHOLDS.new_direction**2 * whole))
         size = np.sqrt(left[which])
         return cls(which, size, square[np.ix_(which, which)] / np.outer(size, size), along[which] / size)
 
@@ -158,7 +147,7 @@ class _Forces:
             free, rest = with_rows[:, : self.starts].reshape(-1, count), with_rows[:, self.starts :].sum(axis=0)
             square = half + half.T
             left = square - free.T @ free
-            if (np.diag(left) < LOST * np.diag(square)).any():
+            if (np.diag(left) < THRESHOLDS.told_by_products * np.diag(square)).any():
                 return None
         return _Columns.of(left, rest[:-1], rest[-1])
 
@@ -168,7 +157,7 @@ def _spanning(square: Array) -> Array:
     if not len(square):
         return np.empty((0, 0))
     square, v = np.linalg.eigh(square)
-    kept = square > JOINT**2 * square[-1]  # far above what squaring loses
+    kept = square > THRESHOLDS.joint_direction**2 * square[-1]  # far above what squaring loses
     return np.asarray(v[:, kept] / np.sqrt(square[kept]))
 
 
@@ -201,18 +190,18 @@ def _absorbed(motion: Tangent) -> Array:
     if not rows.shape[1]:
         return rows
     u, size, _ = np.linalg.svd(rows / (np.linalg.norm(rows, axis=0) + 1e-300), full_matrices=False)
-    return np.asarray(u[:, size > SAME * size[0]])
+    return np.asarray(u[:, size > THRESHOLDS.shared_direction * size[0]])
 
 
 def _shapes(motion: Tangent, site: str) -> dict[str, Array]:
     """Forces (W, S, K) of speed, position, load, input and time, in no particular law's form."""
     (q, v), u, effort = motion.place(site), motion.u, motion.effort(site)
     speed = motion.x[..., v] / _size(motion.x[..., v])
-    fast, sign = np.abs(speed), np.tanh(speed / DRY)[..., None]
-    near = np.exp(-fast[..., None] / DECAYS)
-    hats = np.concatenate([_hats(fast, np.quantile(fast, LEVELS)), near], axis=-1)
+    fast, sign = np.abs(speed), np.tanh(speed / THRESHOLDS.sign_width)[..., None]
+    near = np.exp(-fast[..., None] / THRESHOLDS.speed_decays)
+    hats = np.concatenate([_hats(fast, np.quantile(fast, THRESHOLDS.speeds)), near], axis=-1)
     sides = np.maximum(np.stack([speed, -speed], axis=-1), 0)
-    load = np.minimum(effort / _size(effort), PEAK)[..., None]
+    load = np.minimum(effort / _size(effort), THRESHOLDS.effort_peak)[..., None]
     t = motion.windows.t[:, None] + np.arange(motion.x.shape[1]) * motion.model.period
     late = ((t - t.min()) / max(float(np.ptp(t)), 1e-12))[..., None]
     out = {
@@ -222,11 +211,11 @@ def _shapes(motion: Tangent, site: str) -> dict[str, Array]:
     }
     if u.shape[-1]:
         share, top = u / (np.sqrt(np.mean(u**2, axis=(0, 1))) + 1e-12), u / (np.abs(u).max(axis=(0, 1)) + 1e-12)
-        cut = [*(np.clip(share, -c, c) for c in CUTS), *(np.clip(top, -c, c) for c in HIGH)]
+        cut = [*(np.clip(share, -c, c) for c in THRESHOLDS.input_cuts), *(np.clip(top, -c, c) for c in THRESHOLDS.input_peaks)]
         out["the size of the input"] = np.concatenate([*cut, np.abs(share)], axis=-1)
     if q is not None:
         z = motion.x[..., q]
-        place, at = _hats(z, np.quantile(z, PLACES)), (z - z.mean())[..., None] / max(float(np.ptp(z)) / 2, 1e-12)
+        place, at = _hats(z, np.quantile(z, THRESHOLDS.places)), (z - z.mean())[..., None] / max(float(np.ptp(z)) / 2, 1e-12)
         powers = [at**2, at**3, at**4, at * np.abs(at), np.maximum(at - 0.5, 0), np.maximum(-at - 0.5, 0)]
         moving = [place * speed[..., None], place * sign]
         out[f"the position of {site}"] = np.concatenate([place, *powers, *moving], axis=-1)

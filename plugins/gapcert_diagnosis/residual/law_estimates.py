@@ -22,14 +22,10 @@ from gapcert_diagnosis.fitting.hypothesis import Hypothesis
 from gapcert_diagnosis.fitting.linearised import Tangent
 from gapcert_diagnosis.results import Correction
 from gapcert_diagnosis.search.candidates import Candidate, Causes, Library, sliding, velocity
+from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_figures import Law, called
 
-INTERVALS, POINTS = 24, 400  # of a quantity; of a line
-ALONE, NEAR = 0.9, 0.02  # share of a law that one quantity must explain to carry it; shares that close are equal
-MOST = 24  # pictures
 Members = npt.NDArray[np.intp]
-LOOPS = 4  # windows
-WIDE = 0.5  # widths of a picture's range beyond which an estimate says nothing
 
 
 @final
@@ -167,11 +163,11 @@ def means(values: Array, member: Members, count: int) -> Array:
 
 def carried(law: Array, axis: Axis) -> float:
     """The share of a law's variance along the path that is a function of one quantity."""
-    member = intervals(axis.values, 2 * INTERVALS)
+    member = intervals(axis.values, 2 * THRESHOLDS.quantity_intervals)
     spread = float(np.var(law))
     if spread <= 1e-12 * float(np.mean(law**2)):
         return 1.0
-    left = law - np.nan_to_num(means(law, member, 2 * INTERVALS))[member]
+    left = law - np.nan_to_num(means(law, member, 2 * THRESHOLDS.quantity_intervals))[member]
     return 1 - float(np.mean(left**2)) / spread
 
 
@@ -183,15 +179,15 @@ def laws(path: Fitted, correction: Correction | None = None) -> tuple[Law, ...]:
     groups = list(_groups(path))
     drawn = [_law(path, place, group, axis, law) for place, group, axis, law in groups]
     for site in path.base.sites("coordinate"):
-        if len(drawn) >= MOST:
+        if len(drawn) >= THRESHOLDS.law_pictures:
             break
         place = path.place(site, "coordinate")
-        axes, nothing = path.axes(place)[: MOST - len(drawn)], np.zeros(path.x.shape[:2])
+        axes, nothing = path.axes(place)[: THRESHOLDS.law_pictures - len(drawn)], np.zeros(path.x.shape[:2])
         left = [_law(path, place, (), axis, nothing) for axis in axes]
         if correction is not None and correction.site == site:
             left = [_corrected(path, place, axis, one, correction) for axis, one in zip(axes, left, strict=True)]
         drawn += [replace(one, lead=not path.causes and i == 0) for i, one in enumerate(left)]
-    return tuple(drawn[:MOST])
+    return tuple(drawn[: THRESHOLDS.law_pictures])
 
 
 def _corrected(path: Fitted, place: Place, axis: Axis, left: Law, correction: Correction) -> Law:
@@ -199,7 +195,7 @@ def _corrected(path: Fitted, place: Place, axis: Axis, left: Law, correction: Co
         return left
     with_it = path.full.extend([correction.extension])
     law = place.size(difference(path.base.states, path.next(with_it), path.after))
-    shape = "line" if carried(law, axis) >= ALONE else "cloud"
+    shape = "line" if carried(law, axis) >= THRESHOLDS.carrying_share else "cloud"
     at, line = _drawn(shape, axis.values, law)
     return replace(left, at=at, law=line, shape=shape, named="correction from data")
 
@@ -216,11 +212,11 @@ def _groups(path: Fitted) -> Sequence[tuple[Place, Causes, Axis, Array]]:
         axes = path.axes(place)
         shares = [carried(law, a) for a in axes]
         timed = "{t}" in (path.library.extension(c).force or "")
-        axis = path.time if timed else axes[next(i for i, s in enumerate(shares) if s >= max(shares) - NEAR)]
-        if max(shares) < ALONE and _remembers(path.library.extension(c)):
+        axis = path.time if timed else axes[next(i for i, s in enumerate(shares) if s >= max(shares) - THRESHOLDS.equal_shares)]
+        if max(shares) < THRESHOLDS.carrying_share and _remembers(path.library.extension(c)):
             axis = _turned(path, c, place, axes) or axis
         # A law that no single quantity carries stands alone.
-        key = place.site, f"{axis.name} {c.effect.name}" if max(shares) < ALONE or timed else axis.name
+        key = place.site, f"{axis.name} {c.effect.name}" if max(shares) < THRESHOLDS.carrying_share or timed else axis.name
         groups.setdefault(key, []).append(c)
         where[key] = place, axis
     return [(place, g, axis, place.size(path.added(g))) for k, (place, axis) in where.items() for g in (tuple(groups[k]),)]
@@ -246,25 +242,25 @@ def _place(path: Fitted, c: Candidate) -> Place:
 def _law(path: Fitted, place: Place, group: Causes, axis: Axis, law: Array) -> Law:
     timed = axis.name == "time"
     remembers = any(_remembers(path.library.extension(c)) for c in group)
-    shape = "line" if timed or carried(law, axis) >= ALONE else "loop" if remembers else "cloud"
+    shape = "line" if timed or carried(law, axis) >= THRESHOLDS.carrying_share else "loop" if remembers else "cloud"
     # What happens once is looked at where it happens.
     row = int(np.argmax(np.ptp(law, axis=1)))
-    member = np.full(axis.values.shape, 2 * INTERVALS)
+    member = np.full(axis.values.shape, 2 * THRESHOLDS.quantity_intervals)
     rows = slice(row, row + 1) if timed else slice(None)
-    member[rows] = intervals(axis.values[rows], INTERVALS)
+    member[rows] = intervals(axis.values[rows], THRESHOLDS.quantity_intervals)
     if shape == "loop":
         # What remembers differs between rising and falling.
-        member += INTERVALS * (np.gradient(axis.values, axis=1) >= 0)
+        member += THRESHOLDS.quantity_intervals * (np.gradient(axis.values, axis=1) >= 0)
     label, member = np.unique(member, return_inverse=True)
     member = member.reshape(axis.values.shape)
     further, half = path.asked(place, member)
     x, y = means(axis.values, member, len(label)), means(law, member, len(label)) + further
     at, line = (np.empty(0), np.empty(0)) if not group else _drawn(shape, axis.values[rows], law[rows])
-    reach = max(3 * float(np.median(half)), WIDE * float(np.ptp(law)) if group else 0.0)
-    keep = (half <= reach) & (label < 2 * INTERVALS)
+    reach = max(3 * float(np.median(half)), THRESHOLDS.wide_interval * float(np.ptp(law)) if group else 0.0)
+    keep = (half <= reach) & (label < 2 * THRESHOLDS.quantity_intervals)
     names = " and ".join(called(*c.key).removesuffix(f" at {place.site}") for c in group)
     title = f"{names or 'what is left'} at {place.site}"
-    up = (label[keep] >= INTERVALS).astype(np.float64) if shape == "loop" else np.empty(0)
+    up = (label[keep] >= THRESHOLDS.quantity_intervals).astype(np.float64) if shape == "loop" else np.empty(0)
     return Law(title, axis.label, place.label, x[keep], y[keep], at, line, half[keep], up, shape)
 
 
@@ -275,11 +271,11 @@ def _remembers(e: Extension) -> bool:
 def _drawn(shape: str, x: Array, law: Array) -> tuple[Array, Array]:
     """The law over the path: in order of x, or of time where it is a loop, over the windows where it is largest."""
     if shape == "loop":
-        rows = np.argsort(-np.ptp(law, axis=1), kind="stable")[:LOOPS]
+        rows = np.argsort(-np.ptp(law, axis=1), kind="stable")[: THRESHOLDS.loop_windows]
         apart = np.full((len(rows), 1), np.nan)
         return np.hstack([x[rows], apart]).ravel(), np.hstack([law[rows], apart]).ravel()
     order = np.argsort(x, axis=None)
-    pick = order[np.unique(np.linspace(0, order.size - 1, POINTS).astype(int))]
+    pick = order[np.unique(np.linspace(0, order.size - 1, THRESHOLDS.line_points).astype(int))]
     return x.ravel()[pick], law.ravel()[pick]
 
 
@@ -298,11 +294,11 @@ def outputs(path: Fitted) -> tuple[Law, ...]:
             continue
         i = names[c.site]
         true, law, left = plain[..., i], read[..., i], -last.residual[..., i] * m.sigma[i]
-        member = np.unique(intervals(true, INTERVALS), return_inverse=True)[1].reshape(true.shape)
+        member = np.unique(intervals(true, THRESHOLDS.quantity_intervals), return_inverse=True)[1].reshape(true.shape)
         sizes = np.bincount(member.ravel())
         half = 1.96 * np.sqrt(means(left**2, member, len(sizes)) / sizes / last.whiteness[i])
         axis = Axis(c.site, m.channels[i].unit, true)
-        shape = "line" if carried(law, axis) >= ALONE else "loop"
+        shape = "line" if carried(law, axis) >= THRESHOLDS.carrying_share else "loop"
         y, mid = means(law + left, member, len(sizes)), means(true, member, len(sizes))
         label = f"added to the reading [{m.channels[i].unit}]"
         drawn.append(Law(called(*c.key), axis.label, label, mid, y, *_drawn(shape, true, law), half, shape=shape))

@@ -19,20 +19,12 @@ from scipy.signal import lfilter
 from gapcert.plugin import Array, EffectParameter, Extension, Parameter, site_units
 from gapcert_diagnosis.fitting.linearised import Tangent
 from gapcert_diagnosis.results import Correction
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
 Chosen = npt.NDArray[np.bool_]
-FOLDS = 5
-TURNS = 40  # regressions on residuals whose windows have changed places and signs
-CHANCE = 1.2  # times the best of these, which a share must beat
-LOUD = 4.0  # times the median square of a window's residual
 RIDGE = 10.0 ** np.arange(-5, 3)  # of the mean square of a column
-LAGS = (0.01, 0.05, 0.2, 1.0)  # s: memories of the input that are tried
-LATE = (0.005, 0.02, 0.05)  # s: delays of the input that are tried
-WIDTHS = (0.03, 0.1, 0.3, 0.6)  # of an input's root mean square: half plays; of its rate: limits
-BRISTLES = (0.005, 0.02, 0.05, 0.15)  # of the range of a coordinate: what a bristle may bend
 PERIODS = np.arange(1.5, 16.1, 0.5)  # over the range of a coordinate
 MEMORY = ("input memory", "input hysteresis", "position memory")
-TERMS, WORTH = 4, 0.01  # of a formula: most terms, least share that one must add
 
 
 @final
@@ -64,10 +56,13 @@ def learn(motion: Tangent, site: str) -> Learnt:
     columns = columns / (np.sqrt(np.mean(columns**2, axis=(0, 1))) + 1e-300)
     residual = motion.coarse(motion.residual[..., None])[..., 0]
     energy = np.sum(residual**2, axis=1)
-    even = np.sqrt(np.minimum(1.0, LOUD * np.median(energy) / np.maximum(energy, 1e-300)))[:, None]
+    even = np.sqrt(np.minimum(1.0, THRESHOLDS.loud_window * np.median(energy) / np.maximum(energy, 1e-300)))[:, None]
     rng, count = np.random.default_rng(0), len(columns)
     level = even * residual
-    moved = [np.roll(level, rng.integers(1, max(2, count)), axis=0) * rng.choice([-1.0, 1.0], (count, 1)) for _ in range(TURNS)]
+    moved = [
+        np.roll(level, rng.integers(1, max(2, count)), axis=0) * rng.choice([-1.0, 1.0], (count, 1))
+        for _ in range(THRESHOLDS.chance_turns)
+    ]
     loud = _Regression.of(columns, residual[..., None])
     fair = _Regression.of(even[..., None] * columns, np.stack([level, *moved], axis=-1))
 
@@ -75,7 +70,7 @@ def learn(motion: Tangent, site: str) -> Learnt:
         """The share in windows not seen, 0 where it is chance: there, the same features do as well on windows that have changed
         places and signs. In that comparison windows that stand out count no more than others: one push is no law."""
         shares = fair.shares(chosen)
-        by_chance = shares[0] <= CHANCE * max(0.0, float(shares[1:].max()))
+        by_chance = shares[0] <= THRESHOLDS.chance_share * max(0.0, float(shares[1:].max()))
         return 0.0 if by_chance else max(0.0, float(loud.shares(chosen)[0]))
 
     kinds = {k: predicted(kind == k) if (kind == k).any() else 0.0 for k in ("static", "periodic", *MEMORY)}
@@ -94,9 +89,9 @@ class _Regression:
 
     @classmethod
     def of(cls, columns: Array, residuals: Array) -> _Regression:
-        fold = np.arange(len(columns)) % FOLDS
+        fold = np.arange(len(columns)) % THRESHOLDS.folds
         parts = []
-        for i in range(min(FOLDS, len(columns))):
+        for i in range(min(THRESHOLDS.folds, len(columns))):
             a, b = columns[fold == i].reshape(-1, columns.shape[-1]), residuals[fold == i].reshape(-1, residuals.shape[-1])
             parts.append((a.T @ a, a.T @ b))
         totals = np.sum(residuals**2, axis=(0, 1))
@@ -126,11 +121,11 @@ def input_features(motion: Tangent) -> dict[str, Array]:
 def _input_memory(motion: Tangent) -> Array:
     u, drives, period = motion.u, motion.windows.measured.driven, motion.model.period
     memory: list[Array] = []
-    for lag in LAGS:
+    for lag in THRESHOLDS.input_lags:
         slow = [_low_pass(d, period / lag) for d in drives]
         sizes = [_low_pass(np.abs(d), period / lag) for d in drives]
         memory += [motion.gather(slow), motion.gather(sizes), u * motion.gather(sizes)]
-    memory += [motion.gather([_late(d, round(s / period)) for d in drives]) - u for s in LATE]
+    memory += [motion.gather([_late(d, round(s / period)) for d in drives]) - u for s in THRESHOLDS.input_delays]
     return np.concatenate(memory, axis=-1)
 
 
@@ -138,8 +133,8 @@ def _input_hysteresis(motion: Tangent) -> Array:
     drives = motion.windows.measured.driven
     size = np.sqrt(np.mean(np.concatenate(drives) ** 2, axis=0)) + 1e-300
     rate = np.sqrt(np.mean(np.concatenate([np.diff(d, axis=0) for d in drives]) ** 2, axis=0)) + 1e-300
-    many = np.repeat(motion.u, len(WIDTHS), axis=-1)
-    kinds = ((_play, np.outer(size, WIDTHS)), (_limited, np.outer(rate, WIDTHS)))
+    many = np.repeat(motion.u, len(THRESHOLDS.play_widths), axis=-1)
+    kinds = ((_play, np.outer(size, THRESHOLDS.play_widths)), (_limited, np.outer(rate, THRESHOLDS.play_widths)))
     return np.concatenate([motion.gather([f(d, widths) for d in drives]) - many for f, widths in kinds], axis=-1)
 
 
@@ -166,8 +161,8 @@ def features(motion: Tangent, site: str) -> dict[str, Array]:
 def _bends(motion: Tangent) -> Array:
     """How far each state is from what follows it with play, (W, S, nx, w), in units of that play."""
     spans = np.ptp(motion.x, axis=(0, 1))
-    half = np.outer(np.where(spans > 0, spans, 1.0), BRISTLES)
-    bends = [np.repeat(p, len(BRISTLES), axis=1) - _play(p, half) for p in motion.windows.measured.paths]
+    half = np.outer(np.where(spans > 0, spans, 1.0), THRESHOLDS.bristle_bends)
+    bends = [np.repeat(p, len(THRESHOLDS.bristle_bends), axis=1) - _play(p, half) for p in motion.windows.measured.paths]
     return np.asarray(motion.gather(bends).reshape(*motion.x.shape, -1) / half)
 
 
@@ -257,10 +252,10 @@ def correction(motion: Tangent, site: str) -> Correction | None:
 
     chosen: list[int] = []
     best = 0.0
-    while len(chosen) < TERMS:
+    while len(chosen) < THRESHOLDS.formula_terms:
         scores = {i: judged([*chosen, i]) for i in range(len(terms)) if i not in chosen}
         i = max(scores, key=lambda k: scores[k])
-        if scores[i] < best + WORTH:
+        if scores[i] < best + THRESHOLDS.term_share:
             break
         chosen, best = [*chosen, i], scores[i]
     if not chosen:

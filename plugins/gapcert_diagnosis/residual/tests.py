@@ -15,15 +15,9 @@ from scipy.spatial import KDTree
 from gapcert.plugin import Array
 from gapcert_diagnosis.fitting.fit import lag_one
 from gapcert_diagnosis.fitting.linearised import Tangent
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .unexplained import Left
-
-REACH = 0.2  # s by which an input may lead
-APART = 0.5  # s between two samples that are compared as equal states
-PIECE = 0.06  # s: the missing force is taken as constant for so long
-SMOOTH = 1e-2  # of the mean square of a column: keeps forces that cannot be seen at zero
-SEEN = 2.0  # times its noise, by which a missing force must vary before anything is asked of it
-FEWEST, NEIGHBOURS = 20, 20
 
 
 def evidence(found: Left) -> dict[str, dict[str, float]]:
@@ -44,7 +38,7 @@ def evidence(found: Left) -> dict[str, dict[str, float]]:
         "size with time": by(_together(r**2, long.windows.t[:, None] + m.period * np.arange(r.shape[1]))),
     }
     for i, spec in enumerate(long.model.inputs):
-        out[f"with {spec.name}"] = by(_leading(r, long.windows.u[..., i], m.history, m.samples(REACH)))
+        out[f"with {spec.name}"] = by(_leading(r, long.windows.u[..., i], m.history, m.samples(THRESHOLDS.leading_input)))
     forces = {s: Missing.of(found.short, s) for s in long.model.sites("coordinate")}
     seen = {s: f for s, f in forces.items() if f.seen}
     for i, spec in enumerate((*long.model.states, *long.model.inputs) if seen else ()):
@@ -97,12 +91,12 @@ class Missing:
     @classmethod
     def of(cls, tangent: Tangent, site: str) -> Missing:
         steps = tangent.x.shape[1]
-        count = min(max(3, round(steps * tangent.model.period / PIECE)), steps)
+        count = min(max(3, round(steps * tangent.model.period / THRESHOLDS.constant_force)), steps)
         member = np.arange(steps) * count // steps
         pieces = np.tile(member[:, None] == np.arange(count), (len(tangent.x), 1, 1)).astype(np.float64)
         columns = tangent.responses(site, pieces)
         gram = np.swapaxes(columns, 1, 2) @ columns
-        ridge = SMOOTH * np.mean(np.trace(gram, axis1=1, axis2=2)) / count * np.eye(count) + 1e-300
+        ridge = THRESHOLDS.force_ridge * np.mean(np.trace(gram, axis1=1, axis2=2)) / count * np.eye(count) + 1e-300
         inverse = np.linalg.inv(gram + ridge)
         force = (inverse @ (np.swapaxes(columns, 1, 2) @ tangent.residual[..., None]))[:, 1:-1, 0]
         noise = np.diagonal(inverse @ gram @ inverse, axis1=1, axis2=2)[:, 1:-1]
@@ -113,7 +107,7 @@ class Missing:
     @property
     def seen(self) -> bool:
         """Does it vary by more than noise would make it?"""
-        return self.force.size >= FEWEST and float(np.var(self.force)) > SEEN * self.noise
+        return self.force.size >= THRESHOLDS.force_pieces and float(np.var(self.force)) > THRESHOLDS.seen_force * self.noise
 
     def together(self, column: int) -> float:
         """Its correlation with a state or an input, in standard deviations."""
@@ -126,10 +120,10 @@ class Missing:
         """
         f, t, z = self.force.ravel(), self.t.ravel(), self.z.reshape(self.force.size, -1)
         z = (z - z.mean(axis=0)) / (z.std(axis=0) + 1e-300)
-        near: list[list[int]] = np.asarray(KDTree(z).query(z, k=min(len(f), NEIGHBOURS))[1]).tolist()
-        nearest = ((i, next((j for j in row if abs(t[i] - t[j]) > APART), None)) for i, row in enumerate(near))
+        near: list[list[int]] = np.asarray(KDTree(z).query(z, k=min(len(f), THRESHOLDS.state_neighbours))[1]).tolist()
+        nearest = ((i, next((j for j in row if abs(t[i] - t[j]) > THRESHOLDS.recurrence), None)) for i, row in enumerate(near))
         pairs = [(i, j) for i, j in nearest if j is not None]
-        if len(pairs) < FEWEST:
+        if len(pairs) < THRESHOLDS.force_pieces:
             return None
         first, second = (f[list(side)] for side in zip(*pairs, strict=True))
         differ = 0.5 * float(np.mean((first - second) ** 2))

@@ -14,25 +14,12 @@ from gapcert_diagnosis.fitting.fit import Fit, fit
 from gapcert_diagnosis.fitting.linearised import Tangent
 from gapcert_diagnosis.fitting.restarts import rescued
 from gapcert_diagnosis.results import Push, Unexplained, Verdict
+from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_figures import KINDS
 
 from .lack_of_fit import Lack, lack
 from .regression import Learnt, correction, learn
 from .whiteness import Growth, growth
-
-SHORT = 0.3  # s
-SIGMAS = 4.5  # standard deviations of noise by which long windows must exceed what the colour of short ones predicts
-LEARNT, PLENTY = 0.1, 0.25  # least share of the residual, in windows not seen, that counts as learnt; where nothing grows
-COARSE = 50.0  # mean square of short windows, in units of the white noise floor, that no colour of noise excuses
-FLOOR = 1.05  # mean square, in units of the white noise floor
-SLIGHT, FAINT = 0.005, 0.003  # share of the effort that an integrator may leave; that is not worth a doubt
-BEYOND = 10.0  # share of the effort from which it is no measure: there is next to none
-ADEQUATE = 0.1  # share of the excess over the noise that causes may leave and still be the answer
-SEVERAL = 3  # causes: so many are stand-ins for one law more often than not
-BINS, CLEAR = 10, 0.8  # places in a short window where a push is looked for; share of the residual that it must explain
-EDGE = 0.1  # s: how far from its middle a push may still act
-LOUD = 2.0  # times the median window's energy
-MOST_OF_IT, STRETCHES = 0.8, 5  # share of the excess that is located, in at most so many stretches
 
 
 @final
@@ -60,19 +47,21 @@ class Left:
     def coherent(self) -> bool:
         """Is it more than noise, whatever its colour?"""
         # In strongly coloured noise a regression may find a tenth by chance, but then nothing grows.
-        learnt = self.best is not None and self.best.share > (LEARNT if self.growth.sigmas > 2 else PLENTY)
-        return self.growth.sigmas > SIGMAS or self.growth.chi_short > COARSE or learnt
+        learnt = self.best is not None and self.best.share > (
+            THRESHOLDS.learnt_share if self.growth.sigmas > 2 else THRESHOLDS.learnt_plenty
+        )
+        return self.growth.sigmas > THRESHOLDS.growth_sigmas or self.growth.chi_short > THRESHOLDS.coarse_residual or learnt
 
     @property
     def remains(self) -> bool:
         """And more than an integrator leaves?"""
-        return self.coherent and self.share > SLIGHT
+        return self.coherent and self.share > THRESHOLDS.slight_force
 
 
 def left(model: Model, last: Fit, windows: Windows, seed: int = 0) -> Left:
     """What the final fit leaves; model: with the causes at their fitted numbers, for slopes and for the force of the effort."""
     last, m = rescued(last, windows), windows.measured
-    brief = m.windows(min(m.brief(SHORT), windows.length))
+    brief = m.windows(min(m.brief(THRESHOLDS.short_window), windows.length))
     again = rescued(fit(last.hypothesis, brief, theta=last.theta, iterations=5), brief)
     long, short = Tangent.of(model, windows, last), Tangent.of(model, brief, again)
     found = _judged(long, short, seed)
@@ -85,15 +74,15 @@ def left(model: Model, last: Fit, windows: Windows, seed: int = 0) -> Left:
 def _judged(long: Tangent, short: Tangent, seed: int) -> Left:
     grown, coordinates = growth(long, short, seed), long.model.sites("coordinate")
     # What is at the white noise floor holds nothing to learn.
-    sites = coordinates if grown.chi_long > FLOOR else ()
+    sites = coordinates if grown.chi_long > THRESHOLDS.located_floor else ()
     # Short windows follow the true path; long ones show what is slow. The one that learns more decides.
     both = [(learn(m, s), m) for m in (short, long) for s in sites]
     learnt = tuple(max((k for k, _ in both if k.site == s), key=lambda k: k.share) for s in sites)
     excess = [float(grown.excess.sum()), *(k.share * _square(m) for k, m in both)]
-    if grown.chi_short > COARSE:
+    if grown.chi_short > THRESHOLDS.coarse_residual:
         excess.append(_square(long))
     found = Left(long, short, grown, learnt, _share(long, coordinates, max(excess)))
-    if not long.fitted.hypothesis.charged or (found.coherent and found.share > FAINT):
+    if not long.fitted.hypothesis.charged or (found.coherent and found.share > THRESHOLDS.faint_force):
         return found
     return replace(found, lack=lack(long, short, seed))
 
@@ -126,7 +115,7 @@ def verdict(causes: int, found: Left, last: Fit, nothing: Fit, experiment: bool,
     Causes that leave a tenth of the excess over the noise are an answer even where something small is left beside them.
     lost: nothing of the motion is followed, however little force would do so.
     """
-    if found.remains and not (causes and last.chi.mean() - 1 < ADEQUATE * (nothing.chi.mean() - 1)):
+    if found.remains and not (causes and last.chi.mean() - 1 < THRESHOLDS.adequate_rest * (nothing.chi.mean() - 1)):
         return "unexplained"
     if not causes:
         return "unexplained" if lost else "nothing"
@@ -136,17 +125,17 @@ def verdict(causes: int, found: Left, last: Fit, nothing: Fit, experiment: bool,
 def doubts(causes: int, found: Left) -> tuple[str, ...]:
     """Why named causes may be stand-ins, as sentences."""
     out = []
-    if causes and found.coherent and found.share > FAINT:
+    if causes and found.coherent and found.share > THRESHOLDS.faint_force:
         best = found.best
-        kind = max(best.kinds, key=lambda k: best.kinds[k]) if best and best.share > LEARNT else None
+        kind = max(best.kinds, key=lambda k: best.kinds[k]) if best and best.share > THRESHOLDS.learnt_share else None
         looks = f"; it looks like {KINDS.get(kind, kind)}" if kind else ""
-        size = f"{100 * found.share:.2g} % of the effort" if found.share < BEYOND else "more than any effort here"
+        size = f"{100 * found.share:.2g} % of the effort" if found.share < THRESHOLDS.no_effort else "more than any effort here"
         out.append(f"inadequate: a residual of {size} is left that is not noise{looks}")
     elif causes and found.lack is not None:
         out.append(
             f"inadequate: what is left goes with {found.lack.kind} ({found.lack.sigmas:.2g} standard deviations of noise)"
         )
-    if causes >= SEVERAL:
+    if causes >= THRESHOLDS.several_causes:
         out.append(f"composite: {causes} causes together are often stand-ins for one law that the library lacks")
     return tuple(out)
 
@@ -157,9 +146,9 @@ def unexplained(found: Left) -> Unexplained:
     if best is None:
         return Unexplained(False, where=where)
     kinds = {n: share for n, share in best.kinds.items() if share > 0}
-    if best.memory > LEARNT:
+    if best.memory > THRESHOLDS.learnt_share:
         return Unexplained(True, looks_like=kinds, where=where)
-    if best.share > LEARNT:
+    if best.share > THRESHOLDS.learnt_share:
         formulas = (correction(m, best.site) for m in (found.short, found.long))
         formula = max((f for f in formulas if f is not None), key=lambda f: f.explained, default=None)
         return Unexplained(False, looks_like=kinds, where=where, correction=formula)
@@ -175,9 +164,9 @@ def unexplained(found: Left) -> Unexplained:
 def _where(motion: Tangent) -> tuple[tuple[float, float], ...]:
     """The stretches of time that carry most of the excess over the median window; none where it is all over."""
     energy = np.sum(motion.residual**2, axis=1)
-    over = np.where(energy > LOUD * np.median(energy), energy - np.median(energy), 0.0)
+    over = np.where(energy > THRESHOLDS.loud_energy * np.median(energy), energy - np.median(energy), 0.0)
     order = np.argsort(-over, kind="stable")
-    count = int(np.searchsorted(np.cumsum(over[order]), MOST_OF_IT * over.sum())) + 1
+    count = int(np.searchsorted(np.cumsum(over[order]), THRESHOLDS.located_share * over.sum())) + 1
     if over.sum() <= 0 or count > 0.25 * len(energy):
         return ()
     span = motion.windows.length * motion.windows.measured.period
@@ -188,7 +177,7 @@ def _where(motion: Tangent) -> tuple[tuple[float, float], ...]:
             stretches[-1] = (stretches[-1][0], t + span, stretches[-1][2] + size)
         else:
             stretches.append((t, t + span, size))
-    largest = sorted(stretches, key=lambda s: -s[2])[:STRETCHES]
+    largest = sorted(stretches, key=lambda s: -s[2])[: THRESHOLDS.located_stretches]
     return tuple(sorted((round(a, 6), round(b, 6)) for a, b, _ in largest))
 
 
@@ -199,8 +188,8 @@ def _pushes(motion: Tangent, sites: tuple[str, ...]) -> list[tuple[float, Push]]
     if not 0 < len(rows) <= 0.2 * len(energy):
         return []
     steps = motion.x.shape[1]
-    edges = np.linspace(0, steps, BINS + 1).astype(int)
-    bins = np.digitize(np.arange(steps), edges[1:-1])[:, None] == np.arange(BINS)
+    edges = np.linspace(0, steps, THRESHOLDS.push_bins + 1).astype(int)
+    bins = np.digitize(np.arange(steps), edges[1:-1])[:, None] == np.arange(THRESHOLDS.push_bins)
     found = []
     for site in sites:
         columns = motion.responses(site, np.tile(bins.astype(np.float64), (len(energy), 1, 1)))
@@ -208,7 +197,7 @@ def _pushes(motion: Tangent, sites: tuple[str, ...]) -> list[tuple[float, Push]]
             along = columns[w].T @ motion.residual[w]
             size = np.sum(columns[w] ** 2, axis=0) + 1e-300
             j = int(np.argmax(along**2 / size))
-            if (share := float(along[j] ** 2 / size[j] / energy[w])) > CLEAR:
+            if (share := float(along[j] ** 2 / size[j] / energy[w])) > THRESHOLDS.push_share:
                 impulse = float(along[j] / size[j] * (edges[j + 1] - edges[j]) * motion.model.period)
                 at = float(motion.windows.t[w] + (edges[j] + edges[j + 1]) / 2 * motion.model.period)
                 found.append((share * energy[w], Push(at, site, 1 if impulse > 0 else -1, abs(impulse))))
@@ -220,7 +209,7 @@ def _quiet(motion: Tangent, events: tuple[Push, ...]) -> bool:
     span = motion.windows.length * motion.windows.measured.period
     far = np.ones(len(motion.windows), dtype=bool)
     for event in events:
-        far &= (event.t < motion.windows.t - EDGE) | (event.t > motion.windows.t + span + EDGE)
+        far &= (event.t < motion.windows.t - THRESHOLDS.push_end) | (event.t > motion.windows.t + span + THRESHOLDS.push_end)
     rest: Array = motion.residual[far]
     return bool(rest.size and np.mean(rest**2) < 1.06 + math.sqrt(2 / rest.size))
 
@@ -229,6 +218,6 @@ def _single(found: list[tuple[float, Push]]) -> tuple[Push, ...]:
     """Each push once, in order of time: of those that overlapping windows show, the one with the most energy."""
     kept: list[Push] = []
     for _, push in sorted(found, key=lambda f: -f[0]):
-        if all(abs(push.t - k.t) > SHORT for k in kept):
+        if all(abs(push.t - k.t) > THRESHOLDS.short_window for k in kept):
             kept.append(push)
     return tuple(sorted(kept, key=lambda p: p.t))

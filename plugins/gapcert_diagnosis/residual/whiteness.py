@@ -12,13 +12,9 @@ from scipy.signal import lfilter
 
 from gapcert.plugin import Array
 from gapcert_diagnosis.fitting.linearised import Tangent
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
-COLOURS = (0.0, 0.15, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95)  # correlation of neighbouring samples
-LAGS = 30
-PURE = 1.0  # standard deviations more, where a mixture of colours could excuse what one colour does not
-DRAWS, WARM = 100, 200
 AT_ONCE = 10  # draws, or windows: what memory holds
-CLEAR = 1.05  # least excess that is worth a simulation of its spread
 
 
 @final
@@ -54,22 +50,23 @@ def growth(long: Tangent, short: Tangent, seed: int = 0) -> Growth:
     for model in (expected.mixture, expected.single):
         variances = model(sums)
         beyond, sigmas = expected.beyond(variances, squares)[0], 0.0
-        if beyond.max() > CLEAR:
+        if beyond.max() > THRESHOLDS.clear_excess:
             pairs = [(expected.sums(a), _squares(b)) for a, b in _simulated(variances[0], short, long, seed)]
             a, b = (np.concatenate(rows) for rows in zip(*pairs, strict=True))
             drawn = np.log(expected.beyond(model(a), b))
             sigmas = float(np.max((np.log(beyond) - drawn.mean(axis=0)) / np.maximum(drawn.std(axis=0), 1e-9)))
         found[model.__name__] = beyond, sigmas
     beyond, sigmas = found["mixture"]
-    if found["single"][1] - PURE > sigmas:
-        beyond, sigmas = found["single"][0], found["single"][1] - PURE
+    if found["single"][1] - THRESHOLDS.single_colour > sigmas:
+        beyond, sigmas = found["single"][0], found["single"][1] - THRESHOLDS.single_colour
     chi = squares[0] / (len(long.windows) * long.windows.length)
     excess = np.maximum(chi * (1 - 1 / np.maximum(beyond, 1e-300)), 0.0)
     return Growth(float(chi.mean()), float(np.mean(short.residual**2)), beyond, sigmas, excess)
 
 
 def noise(long: Tangent, short: Tangent, seed: int = 0) -> tuple[Array, Array]:
-    """Residuals (DRAWS, W, L, ny) of long windows in noise of the colour of short ones: of one colour, and of any mixture."""
+    """Residuals (`noise_draws`, W, L, ny) of long windows in noise of the colour of short ones: of one colour, and of any
+    mixture."""
     expected = _Expected.of(short, long)
     sums = expected.sums(_residual(short))
     drawn = [[b for _, b in _simulated(model(sums)[0], short, long, seed)] for model in (expected.single, expected.mixture)]
@@ -87,7 +84,7 @@ class _Expected:
 
     @classmethod
     def of(cls, short: Tangent, long: Tangent) -> _Expected:
-        lags = min(LAGS, short.windows.length // 2)
+        lags = min(THRESHOLDS.colour_lags, short.windows.length // 2)
         return cls(_sums(short, lags), _sums(long, 0)[0])
 
     def sums(self, rows: Array) -> Array:
@@ -109,7 +106,7 @@ class _Expected:
         out = np.zeros((len(sums), *self.long.shape[1:]))
         for c in range(sums.shape[2]):
             own, best = sums[:, :, c], np.full(len(sums), np.inf)
-            for j in range(len(COLOURS) - 1):
+            for j in range(len(THRESHOLDS.noise_colours) - 1):
                 columns = self.short[:, c, c, j : j + 2]
                 pair = _nearest_pair(columns, own)
                 left = np.sum((pair @ columns.T - own) ** 2, axis=1)
@@ -160,7 +157,7 @@ def _sums(motion: Tangent, lags: int) -> Array:
     w, length, ny = motion.windows.y.shape
     basis = motion.free.reshape(w, length, ny, -1).transpose(2, 0, 3, 1)
     gap = np.abs(np.subtract.outer(np.arange(length), np.arange(length)))
-    covers, kinds = [colour**gap for colour in COLOURS], len(COLOURS)
+    covers, kinds = [colour**gap for colour in THRESHOLDS.noise_colours], len(THRESHOLDS.noise_colours)
     out, square = np.zeros((lags + 1, ny, kinds * ny)), np.zeros((ny, length, length))
     for start in range(0, w, AT_ONCE):
         q = np.ascontiguousarray(basis[:, start : start + AT_ONCE])  # Qᵀ of some windows, (ny, w, nx, L)
@@ -171,7 +168,7 @@ def _sums(motion: Tangent, lags: int) -> Array:
             out[k] += (q[..., : length - k] @ np.swapaxes(q[..., k:], 2, 3)).reshape(ny, -1) @ inner.T
     found = np.swapaxes(out.reshape(lags + 1, ny, kinds, ny), 2, 3).copy()
     each = np.arange(ny)
-    for j, (colour, cover) in enumerate(zip(COLOURS, covers, strict=True)):
+    for j, (colour, cover) in enumerate(zip(THRESHOLDS.noise_colours, covers, strict=True)):
         for k, passed in enumerate(_diagonals(cover, square, lags)):
             found[k, each, each, j] += w * (length - k) * colour**k - 2 * passed
     return found
@@ -188,14 +185,18 @@ def _diagonals(cover: Array, square: Array, lags: int) -> list[Array]:
 def _simulated(variances: Array, short: Tangent, long: Tangent, seed: int) -> Iterator[tuple[Array, Array]]:
     """Residuals (short, long) that logs of nothing but this noise (ny, J) would leave, some logs (W, n, ny, L) at a time."""
     rng, ny = np.random.default_rng(seed), len(variances)
-    there = [(d, COLOURS[j], np.sqrt(v * (1 - COLOURS[j] ** 2))) for (d, j), v in np.ndenumerate(variances) if v > 0]
+    there = [
+        (d, THRESHOLDS.noise_colours[j], np.sqrt(v * (1 - THRESHOLDS.noise_colours[j] ** 2)))
+        for (d, j), v in np.ndenumerate(variances)
+        if v > 0
+    ]
     logged = [_Logged.of(m) for m in (short, long)]
-    steps = WARM + max(m.windows * m.length for m in logged)
-    for _ in range(0, DRAWS, AT_ONCE):
+    steps = THRESHOLDS.noise_warm_up + max(m.windows * m.length for m in logged)
+    for _ in range(0, THRESHOLDS.noise_draws, AT_ONCE):
         noise, fresh = np.zeros((AT_ONCE, ny, steps)), rng.standard_normal((AT_ONCE, len(there), steps))
         for i, (d, colour, size) in enumerate(there):
             noise[:, d] += lfilter([1.0], [1.0, -colour], size * fresh[:, i])
-        a, b = (m.residual(noise[..., WARM:]) for m in logged)
+        a, b = (m.residual(noise[..., THRESHOLDS.noise_warm_up :]) for m in logged)
         yield a, b
 
 

@@ -12,17 +12,13 @@ from gapcert.plugin import EffectParameter
 from gapcert_diagnosis.data.dataset import Dataset, Windows
 from gapcert_diagnosis.fitting.fit import Fit
 from gapcert_diagnosis.results import Seen
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Candidate, Causes, Library
-from .criterion import TIE, Found, fails, keys, rank, richer, values, without
+from .criterion import Found, fails, keys, rank, richer, values, without
 from .fitted_sets import FittedSets
 from .moves import additions, spared
 from .validation import judge
-
-FAR = 3 * TIE  # rivals that are worse by more on the earlier data are not fitted again
-LIKELY = 0.3  # share of the best promise, from which a relative of a cause is fitted
-EVEN = 4.0  # score by which one of equally simple sets is plainly the best
-EDGE = 1e-6  # of the width of a number's bounds
 
 
 @final
@@ -97,7 +93,7 @@ def _richer(search: FittedSets, whole: FittedSets, found: Found, later: Windows)
             if not search.library.within(c, e) or keys(new) == keys(found[0]):
                 continue
             known = search.known(new)
-            if known is None or search.better(known, found[1]) < -TIE or _refuted(search, new, found, later):
+            if known is None or search.better(known, found[1]) < -THRESHOLDS.tie_score or _refuted(search, new, found, later):
                 continue
             fits = whole.fit_from(new, known), whole.fit_from(*found)
             if whole.better(*fits) > richer(fits, whole.cautious) and whole.matters((new, fits[0])):
@@ -111,7 +107,7 @@ def _simplest(search: FittedSets, found: Sequence[Found]) -> Found:
     fewest = min(library.simplicity(s)[0] for s, _ in found)
     best = rank([f for f in found if library.simplicity(f[0])[0] == fewest], search.cautious)
     best = [f for f in best if not any(_implausible(library, c, f[1]) for c in f[0])] or best
-    even = [f for f in best if search.better(best[0][1], f[1]) < EVEN]
+    even = [f for f in best if search.better(best[0][1], f[1]) < THRESHOLDS.even_score]
     return min(even, key=lambda f: library.simplicity(f[0]))
 
 
@@ -127,7 +123,7 @@ def _alternatives(search: FittedSets, whole: FittedSets, found: Found, c: Candid
     # Fits to short windows are not compared with those to long ones: the best of each.
     short = bool(tried) and all(keys(s) in search.lost for s, _ in tried)
     groups = [rank(g, search.cautious) for g in ((tried, kin) if short else ([*tried, *kin],))]
-    near = [f for g in groups for i, f in enumerate(g) if i == 0 or search.better(found[1], f[1]) < FAR]
+    near = [f for g in groups for i, f in enumerate(g) if i == 0 or search.better(found[1], f[1]) < THRESHOLDS.far_rival]
     return tuple(rank([(s, whole.fit_from(s, f)) for s, f in near], search.cautious))
 
 
@@ -141,7 +137,7 @@ def _relatives(search: FittedSets, base: Found, c: Candidate) -> list[Causes]:
             (e, *more) = s.move
             kin = e.effect.family == family or e.effect.name in same or c.effect.name in e.effect.equivalent
             richer = contains(e.effect.name, c.effect.name)
-            if kin and not (richer or more or e.key == c.key) and s.gain > LIKELY * best:
+            if kin and not (richer or more or e.key == c.key) and s.gain > THRESHOLDS.likely_relative * best:
                 out[e.key] = (*base[0], e)
     return list(out.values())
 
@@ -155,7 +151,7 @@ def _ties(search: FittedSets, last: Found, rivals: Mapping[tuple[str, str], tupl
         for f in found:
             (e,) = without(f[0], causes)
             alone = spared(search, causes, f[0])
-            least = richer([now, f[1]], search.cautious, alone) if search.library.related(c, e) else TIE
+            least = richer([now, f[1]], search.cautious, alone) if search.library.related(c, e) else THRESHOLDS.tie_score
             if search.better(now, f[1]) < least:
                 out.append(f)
     return out
@@ -190,7 +186,7 @@ def flags(library: Library, c: Candidate, fitted: Fit) -> tuple[str, ...]:
             # A factor that does nothing at 1 (`off`) has no unit: its sign is a convention of the log.
             turned = not p.dimension and p.off == 1.0 and least <= -value <= most
             out.append(f"{said}; is the sign of {c.site} in the log the other way round than in the model?" if turned else said)
-        elif min(value - low[i], high[i] - value) < EDGE * (high[i] - low[i]) and value != off:
+        elif min(value - low[i], high[i] - value) < THRESHOLDS.at_bound * (high[i] - low[i]) and value != off:
             out.append(
                 f"at the edge: {p.name} = {value:.4g}{unit} is the {'least' if value == low[i] else 'most'} that was tried"
             )

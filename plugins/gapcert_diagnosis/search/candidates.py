@@ -26,14 +26,9 @@ from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.fitting.fit import Hypothesis
 from gapcert_diagnosis.fitting.step_size import built
 from gapcert_diagnosis.results import ORDER
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
-SWEPT = 1000  # points of a range
-REACH = 3.0  # tolerances that a stated parameter may be off before that is itself a cause
-SIGMAS = 2.0  # standard deviations that a stated tolerance stands for
-STEP = 0.1  # of the smallest start: difference steps must see over the kinks of dry laws
-NUISANCE_STEP = 0.1  # of a tolerance
 EARTH = ("gravity_x", "gravity_y", "gravity_z")  # known, unless the data are a simulator's
-DOUBTS, FAR = (-0.1, 0.1), 50.0  # of the scale of a doubt: where a search begins, and how far it may go
 
 
 @final
@@ -103,7 +98,7 @@ class Library:
 
     def _roughened(self, c: Candidate, found: Mapping[str, float]) -> Dataset:
         """With a noise floor of at least what the effect does to its channel over the range of the motion."""
-        x, u = (np.linspace(a.min(axis=0), a.max(axis=0), SWEPT) for a in self._path)
+        x, u = (np.linspace(a.min(axis=0), a.max(axis=0), THRESHOLDS.swept_points) for a in self._path)
         plain, acting = (m.output(x, u) for m in (self.model, self.extended((c,), found)))
         moved = difference(self.model.outputs, acting, plain)[:, list(self.measured.columns)]
         added, known = np.sqrt(np.mean(moved**2, axis=0)), self.measured.rough if self.measured.rough.size else 0.0
@@ -183,7 +178,9 @@ class Library:
         """First values (s, p) of a candidate's parameters."""
         if (freed := self.freed(c)) is not None:
             scale = self.doubted(c)
-            return np.array([[freed.value + s * scale] for s in DOUBTS] if scale is not None else [[freed.value]])
+            return np.array(
+                [[freed.value + s * scale] for s in THRESHOLDS.doubt_starts] if scale is not None else [[freed.value]]
+            )
         return np.array(c.effect.grid(self.scales(c)), dtype=np.float64).reshape(-1, len(c.effect.parameters))
 
     def amplitude(self, c: Candidate) -> int | None:
@@ -206,15 +203,15 @@ class Library:
         """(low, high) of a candidate's parameters, in their units."""
         stated, doubt = self.freed(c), self.doubted(c)
         if stated is not None and doubt is not None:
-            ends = stated.value - FAR * doubt, stated.value + FAR * doubt
+            ends = stated.value - THRESHOLDS.doubt_reach * doubt, stated.value + THRESHOLDS.doubt_reach * doubt
             return np.array([max(ends[0], stated.low)]), np.array([min(ends[1], stated.high)])
         scale = np.array([p.scale(self.scales(c)) for p in c.effect.parameters])
         low, high = (np.array([getattr(p, n) for p in c.effect.parameters]) * scale for n in ("low", "high"))
         if stated is not None:
             low, high = np.sort([stated.value * low / scale, stated.value * high / scale], axis=0)
             if stated.low < 0:  # A place, or a component, may have either sign.
-                low = np.minimum(low, stated.value - FAR * stated.tolerance)
-                high = np.maximum(high, stated.value + FAR * stated.tolerance)
+                low = np.minimum(low, stated.value - THRESHOLDS.doubt_reach * stated.tolerance)
+                high = np.maximum(high, stated.value + THRESHOLDS.doubt_reach * stated.tolerance)
             low, high = np.maximum(low, stated.low), np.minimum(high, stated.high)
         return low, high
 
@@ -239,14 +236,16 @@ class Library:
         rows: list[tuple[str, float, float, float, float, float]] = []
         for p in self.model.parameters:
             if p.tolerance > 0 and p.name not in freed:
-                far = REACH * p.tolerance
+                far = THRESHOLDS.nuisance_reach * p.tolerance
                 near = max(p.low, p.value - far), min(p.high, p.value + far)
-                rows.append((p.name, p.value, *near, NUISANCE_STEP * p.tolerance, p.tolerance / SIGMAS))
+                rows.append(
+                    (p.name, p.value, *near, THRESHOLDS.nuisance_step * p.tolerance, p.tolerance / THRESHOLDS.tolerance_sigmas)
+                )
         for c in causes:
             low, high = (b.tolist() for b in self.bounds(c))
             if (stated := self.freed(c)) is not None:
                 doubt = self.doubted(c)
-                step = NUISANCE_STEP * (stated.tolerance if doubt is None else DOUBTS[-1] * doubt)
+                step = THRESHOLDS.nuisance_step * (stated.tolerance if doubt is None else THRESHOLDS.doubt_starts[-1] * doubt)
                 rows.append((stated.name, stated.value, low[0], high[0], step, math.inf))
                 continue
             for i, (name, e) in enumerate(zip(self.names(c), c.effect.parameters, strict=True)):
@@ -288,7 +287,7 @@ class Library:
 
 
 def _step(p: EffectParameter, scale: float) -> float:
-    return scale * (p.step or STEP * min(abs(s - p.off) if not p.dimension else abs(s) for s in p.starts))
+    return scale * (p.step or THRESHOLDS.difference_step * min(abs(s - p.off) if not p.dimension else abs(s) for s in p.starts))
 
 
 def _reads(effect: Effect) -> bool:

@@ -5,19 +5,21 @@ squared residual of a channel over that of noise, G the charge for one more caus
 
 | test           | compares                         | holds where                                   | asked by       |
 | -------------- | -------------------------------- | --------------------------------------------- | -------------- |
-| `noise`        | a fit, the noise floor           | χ ≤ max(NOISE, 1 + chance) in all channels    | everyone       |
-| `pays`         | a set, one without some causes   | χ falls, ΔS > G; z > SURE if it falls little  | steps, drops   |
+| `noise`        | a fit, the noise floor           | χ ≤ max(`noise_level`, 1 + chance) in all channels    | everyone       |
+| `pays`         | a set, one without some causes   | χ falls, ΔS > G; z > `sure_errors` if it falls little  | steps, drops   |
 | `decides`      | a set, one without one cause     | χ > PLAIN² without it, most of that gone      | `matters`      |
 | `outdoes`      | a set, one on another path       | ΔS > 0; if it is larger ΔS > G, and it pays   | steps          |
-| `beats`        | two causes at once, single steps | ΔS > TIE; ΔS > 0 if they are fewer            | pairs          |
-| `margin`       | a set, one with another law      | ΔS > ±`richer` by its numbers; as many: ±TIE  | exchanges      |
-| `richer`       | a law, one that it contains      | ΔS > RICHER                                   | ties, `margin` |
-| `agrees`       | two fits, on later data          | these see AGREE of the excess over noise gone | later data     |
-| `fails`        | a fit on later data, its due     | χ > LATE times what is due                    | later data     |
-| `setting_pays` | a fit under another setting      | χ falls by MUCH, ΔS > charge                  | settings       |
+| `beats`        | two causes at once, single steps | ΔS > `tie_score`; ΔS > 0 if they are fewer            | pairs          |
+| `margin`       | a set, one with another law      | ΔS > ±`richer` by its numbers; as many: ±`tie_score`  | exchanges      |
+| `richer`       | a law, one that it contains      | ΔS > `richer_score`                                   | ties, `margin` |
+| `agrees`       | two fits, on later data          | these see `guard_share` of the excess over noise gone | later data     |
+| `fails`        | a fit on later data, its due     | χ > `late_residual` times what is due                    | later data
+| | `setting_pays` | a fit under another setting      | χ falls by `setting_share`, ΔS > charge                  | settings
+ |
 
 Where a search is cautious and the closer of two fits is rough, ΔS is at most z², `rough_charge` stands for G, and SURE² or
-SPARED for RICHER. `effect_size` says which causes are too small to be named, `native.stepwise` what pays for an engine.
+`spared_score` for `richer_score`. `effect_size` says which causes are too small to be named, `native.stepwise` what pays for an
+engine.
 """
 
 from __future__ import annotations
@@ -30,27 +32,9 @@ import numpy as np
 
 from gapcert.plugin import Array
 from gapcert_diagnosis.fitting.fit import Fit, Hypothesis
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Causes, Library
-
-NOISE = 1.05
-SURE, OFTEN = 3.0, 0.8  # standard errors
-TIE = 10.0  # scores closer than this cannot be told apart
-COPIED = 6.6  # score of one number that is there by chance in one of a hundred cases
-COLOURED = 0.5  # whiteness below which a residual is no white noise
-FALL = 0.03  # least relative fall of the squared residual
-PRIOR_FALL = 16.0  # of the prior, where a wrong value was hidden in other numbers
-SMALL, SMALL_COLOURED = 0.1, 0.3  # relative falls below which windows must agree by SURE; the second where coloured
-PLAIN, MOSTLY = 5.0, (0.5, 0.8)  # noise floors; share of the residual that a cause of little force must explain, if it is rough
-RICHER = 4.0  # score by which a law must beat one that it contains, beyond the charge for its numbers
-SPARED = 1.0  # the same at one of several sites that are judged at once: windows that lean to it by a standard error
-QUIET = 1.1  # residual per noise floor below which later data have nothing to say
-SAME = 0.1  # noise floors between two motions that later data cannot tell apart
-CREEP = 1.5  # residual per noise floor of later data at rest: a law may let a joint creep that sticks
-LEAN = 1.0  # standard errors by which rough windows must agree
-AGREE = 0.15  # least share of the excess over the noise that the guard must see explained
-LATE = 1.5  # times the residual of the earlier windows, from which the later ones may hold a push of their own
-MUCH = 0.5  # least share of the squared residual that a setting explains: a stand-in for what is missing takes less
 
 Keys = frozenset[tuple[str, str]]
 Found = tuple[Causes, Fit]
@@ -80,14 +64,14 @@ def agreement(fell: Array) -> float:
     return float(fell.mean()) / max(error, 1e-12)
 
 
-def noise(fitted: Fit, beyond: float = OFTEN) -> bool:
-    """Is no more left than NOISE noise floors, or than chance shows in so few samples of the worst of the channels?
+def noise(fitted: Fit, beyond: float = THRESHOLDS.often_errors) -> bool:
+    """Is no more left than `noise_level` noise floors, or than chance shows in so few samples of the worst of the channels?
 
     beyond: standard errors more than that one usually has.
     """
     worst = beyond + math.sqrt(2 * math.log(len(fitted.chi)))
-    chance = worst * np.sqrt(2 / np.maximum(np.maximum(fitted.whiteness, COLOURED) * fitted.counts, 1.0))
-    return bool((fitted.chi <= np.maximum(NOISE, 1 + chance)).all())
+    chance = worst * np.sqrt(2 / np.maximum(np.maximum(fitted.whiteness, THRESHOLDS.white_enough) * fitted.counts, 1.0))
+    return bool((fitted.chi <= np.maximum(THRESHOLDS.noise_level, 1 + chance)).all())
 
 
 def pays(new: Fit, old: Fit, charge: float, rough: float | None = None) -> bool:
@@ -95,22 +79,22 @@ def pays(new: Fit, old: Fit, charge: float, rough: float | None = None) -> bool:
 
     rough: what is charged to a cautious search where the closer fit is rough.
     """
-    fell, by_prior = 1 - new.chi / old.chi, old.prior - new.prior > PRIOR_FALL
-    if not ((fell > FALL).any() or by_prior):
+    fell, by_prior = 1 - new.chi / old.chi, old.prior - new.prior > THRESHOLDS.prior_fall
+    if not ((fell > THRESHOLDS.least_fall).any() or by_prior):
         return False
     if rough is not None and closest([new, old]).rough:
         return better(new, old, cautious=True) > min(rough, charge)
     if better(new, old) <= charge:
         return False
     most = int(np.argmax(fell))
-    small = SMALL if new.whiteness[most] > COLOURED else SMALL_COLOURED
-    return bool(fell[most] > small or by_prior) or agreement(falls(new, old)) > SURE
+    small = THRESHOLDS.small_gain if new.whiteness[most] > THRESHOLDS.white_enough else THRESHOLDS.small_gain_coloured
+    return bool(fell[most] > small or by_prior) or agreement(falls(new, old)) > THRESHOLDS.sure_errors
 
 
 def decides(whole: Fit, without: Fit) -> bool:
     """Is the residual plainly above the noise without a cause, and most of it gone with it?"""
-    most = MOSTLY[whole.rough]
-    return bool(((without.chi > PLAIN**2) & (whole.chi < (1 - most) ** 2 * without.chi)).any())
+    most = THRESHOLDS.little_force_share[whole.rough]
+    return bool(((without.chi > THRESHOLDS.plain_residual**2) & (whole.chi < (1 - most) ** 2 * without.chi)).any())
 
 
 def outdoes(new: Fit, best: Fit, charge: float, rough: float | None = None, *, larger: bool) -> bool:
@@ -121,13 +105,13 @@ def outdoes(new: Fit, best: Fit, charge: float, rough: float | None = None, *, l
 
 def beats(new: Fit, old: Fit, cautious: bool, *, fewer: bool) -> bool:
     """By a plain difference of the score, or with fewer causes."""
-    return better(new, old, cautious) > (0.0 if fewer else TIE)
+    return better(new, old, cautious) > (0.0 if fewer else THRESHOLDS.tie_score)
 
 
 def richer(fits: Sequence[Fit], cautious: bool, spared: bool = False) -> float:
     """The score by which a law must beat one that it contains; spared: at one of several sites that are judged at once."""
-    rough = SPARED if spared else SURE**2
-    return rough if cautious and closest(fits).rough else RICHER
+    rough = THRESHOLDS.spared_score if spared else THRESHOLDS.sure_errors**2
+    return rough if cautious and closest(fits).rough else THRESHOLDS.richer_score
 
 
 def margin(fits: Sequence[Fit], more: int, cautious: bool, *, merged: bool, spared: bool) -> float:
@@ -136,7 +120,7 @@ def margin(fits: Sequence[Fit], more: int, cautious: bool, *, merged: bool, spar
     merged: it has one law instead of two; with as many numbers, that need not even fit as well.
     """
     if more == 0:
-        return -TIE if merged else TIE
+        return -THRESHOLDS.tie_score if merged else THRESHOLDS.tie_score
     return math.copysign(richer(fits, cautious, spared), more)
 
 
@@ -147,30 +131,37 @@ def agrees(new: Fit, old: Fit, one: Fit, two: Fit) -> bool:
     """
     after, before = one.chi, two.chi
     # A push that is over, a joint at rest, a channel that is not moved here: these data contradict nothing.
-    if max(after.max(), before.max()) < QUIET or np.mean((one.residual - two.residual) ** 2) < SAME**2:
+    if (
+        max(after.max(), before.max()) < THRESHOLDS.quiet
+        or np.mean((one.residual - two.residual) ** 2) < THRESHOLDS.same_motion**2
+    ):
         return True
-    concerned = new.chi < (1 - FALL) * old.chi
-    if before[concerned].max(initial=0.0) < QUIET and agreement(falls(one, two)) > -SURE and after.max() < CREEP:
+    concerned = new.chi < (1 - THRESHOLDS.least_fall) * old.chi
+    if (
+        before[concerned].max(initial=0.0) < THRESHOLDS.quiet
+        and agreement(falls(one, two)) > -THRESHOLDS.sure_errors
+        and after.max() < THRESHOLDS.creep_residual
+    ):
         return True
     if one.rough:
         fell = (two.typical - one.typical) / np.maximum(two.typical - 1, 1e-9)
-        return bool(fell.max() >= AGREE and agreement(falls(one, two)) > LEAN)
+        return bool(fell.max() >= THRESHOLDS.guard_share and agreement(falls(one, two)) > THRESHOLDS.leaning_errors)
     worst = int(np.argmax(before))
-    if old.prior - new.prior > PRIOR_FALL and (after < 1.05 * np.maximum(before, 1.0)).all():
+    if old.prior - new.prior > THRESHOLDS.prior_fall and (after < 1.05 * np.maximum(before, 1.0)).all():
         return True
-    return bool(before[worst] - after[worst] >= max(AGREE * (before[worst] - 1), 1e-9))
+    return bool(before[worst] - after[worst] >= max(THRESHOLDS.guard_share * (before[worst] - 1), 1e-9))
 
 
 def fails(later: Fit, chi: float) -> bool:
     """Is a fit, judged on later data, plainly further off there than it should be?"""
-    return float(later.chi.max()) > LATE * chi
+    return float(later.chi.max()) > THRESHOLDS.late_residual * chi
 
 
 def setting_pays(new: Fit, old: Fit, charge: float, *, fewer: bool) -> bool:
     """In place of causes only the choice of a setting is charged; beside them it pays for itself."""
     if fewer:
         return better(new, old) > charge - 12
-    much = bool((new.chi < (1 - MUCH) * old.chi).any() and new.chi.sum() < old.chi.sum())
+    much = bool((new.chi < (1 - THRESHOLDS.setting_share) * old.chi).any() and new.chi.sum() < old.chi.sum())
     return much and better(new, old) > charge
 
 
@@ -201,7 +192,7 @@ def rough_charge(library: Library, causes: Causes, before: Causes) -> float:
     simpler = {n: k for n in names - known for k in sorted(known) if contains(k, n)}
     if {richer.get(n, simpler.get(n, n)) for n in names} != known:
         return math.inf
-    return COPIED + (SURE**2 if richer else 0.0)
+    return THRESHOLDS.number_score + (THRESHOLDS.sure_errors**2 if richer else 0.0)
 
 
 def values(fitted: Fit) -> dict[str, float]:

@@ -8,18 +8,20 @@ from collections.abc import Mapping
 import numpy as np
 
 from gapcert.plugin import Array, difference
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Candidate, Causes, sliding, velocity
 from .screening import Screen
-
-LEAST = 0.01  # share of the effort: integrators leave as much
-LEAST_SHOWN = 0.001  # share of the spread of an output
 
 
 def negligible(screen: Screen, causes: Causes, values: Mapping[str, float]) -> tuple[tuple[str, str, float], ...]:
     """(effect, site, share of the effort) of causes that are too small to be named."""
     shares = [(c, share(screen, c, values)) for c in causes]
-    return tuple((*c.key, s) for c, s in shares if s < (LEAST_SHOWN if c.effect.site == "output" else LEAST))
+    return tuple(
+        (*c.key, s)
+        for c, s in shares
+        if s < (THRESHOLDS.least_output if c.effect.site == "output" else THRESHOLDS.least_effort)
+    )
 
 
 def share(screen: Screen, c: Candidate, values: Mapping[str, float]) -> float:

@@ -14,21 +14,13 @@ import numpy as np
 from gapcert.plugin import Effect, Model, UsageError, Variant
 from gapcert_diagnosis.data.dataset import Windows
 from gapcert_diagnosis.fitting.fit import Fit, fit, stepped
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Causes, Library, once
-from .criterion import FALL, PLAIN, QUIET, SURE, Found, better, noise, numbers, setting_pays, values, without
-from .fitted_sets import SECOND, FittedSets
-from .moves import CLOSE, additions
+from .criterion import Found, better, noise, numbers, setting_pays, values, without
+from .fitted_sets import FittedSets
+from .moves import additions
 from .validation import confirms, search_windows
-
-SCREENED = 4_000  # measured values on which all settings are tried
-FINALISTS = 2
-CONTENDERS = 3  # settings that are fitted, of those that one step shows to be the best
-MOST = 2  # settings
-HOPELESS = 0.9  # of the squared residual without a setting: what leaves more of it after a step is not fitted
-LIKE = 0.2  # of what a cause explains, what a setting in its place has to move: this share, up to its inverse
-STILL = 1e-9  # of the squared residual: how friction is solved changes nothing where there is none
-TINY = 1e-12  # noise floors squared: data of a simulator are hit exactly
 
 Tried = tuple[Variant, Causes, Fit]
 Numbers = dict[str, float]
@@ -63,13 +55,15 @@ def across(library: Library, effects: Sequence[Effect], windows: Windows, tell: 
     """
     under = _Settings(library, effects, windows, tell)
     variants = library.model.variants()
-    if not variants or (plain := fit(library.hypothesis(()), under.earlier)).chi.max() < QUIET:
+    if not variants or (plain := fit(library.hypothesis(()), under.earlier)).chi.max() < THRESHOLDS.quiet:
         return Settled(*search_windows(library, windows, tell, plain if variants else None), ())
     alone = under.rank(variants, ())
     if (at_once := under.at_once(variants, alone, plain)) is not None:
         return at_once
     settled = Settled(*search_windows(library, windows, tell, plain), ())
-    while len(settled.settings) < MOST and (new := under.better(settled, alone, len(variants))) is not None:
+    while (
+        len(settled.settings) < THRESHOLDS.settings_named and (new := under.better(settled, alone, len(variants))) is not None
+    ):
         settled, under = new, _Settings(new.search.library, effects, windows, tell)
         done = {s.variant.setting for s in new.settings}
         variants = [v for v in under.library.model.variants() if v.setting not in done]
@@ -87,7 +81,7 @@ class _Settings:
         self._bare: dict[int, Library] = {}
         self._fits: dict[tuple[object, ...], Fit] = {}
         self._near: dict[tuple[object, ...], list[tuple[Variant, tuple[Variant, Fit, Fit] | None]]] = {}
-        count = max(1, round(len(self.earlier) * min(1.0, SCREENED / self.earlier.y.size)))
+        count = max(1, round(len(self.earlier) * min(1.0, THRESHOLDS.setting_values / self.earlier.y.size)))
         self.few = self.earlier.take(np.unique(np.linspace(0, len(self.earlier) - 1, count).astype(np.intp)))
 
     def at_once(self, variants: Sequence[Variant], alone: Sequence[Tried], plain: Fit) -> Settled | None:
@@ -100,11 +94,11 @@ class _Settings:
         if not self.library.measured.exact:
             return None
         sets = FittedSets(self.library, self.earlier, self.tell, plain)
-        likely = additions(sets, ((), sets.nothing))[:FINALISTS]
-        if exact := [f for f in likely if f[1].chi.max() < QUIET]:
+        likely = additions(sets, ((), sets.nothing))[: THRESHOLDS.setting_finalists]
+        if exact := [f for f in likely if f[1].chi.max() < THRESHOLDS.quiet]:
             # Beside a setting a simpler law may do: two numbers that are one, say.
             likely = [f for e in exact for f in _simpler(sets, e)]
-        for causes, now in likely if all(f.chi.max() >= QUIET for _, f in likely) else ():
+        for causes, now in likely if all(f.chi.max() >= THRESHOLDS.quiet for _, f in likely) else ():
             tried = self.rank(variants, causes, values(now))
             if (setting := self.whole(tried, now)) is not None:
                 return Settled(*self.under(setting.variant), (setting,))
@@ -113,10 +107,10 @@ class _Settings:
     def whole(self, tried: Sequence[Tried], before: Fit) -> Setting | None:
         """The first of those that were tried, if nothing is left with it."""
         for variant, causes, first in tried[:1]:
-            if not self.library.measured.exact and first.chi.max() > PLAIN:
+            if not self.library.measured.exact and first.chi.max() > THRESHOLDS.plain_residual:
                 return None
             found = self.fitted(variant.model, causes, self.earlier, values(first))
-            if found.chi.max() < QUIET and self.pays(found, before, self.library.charge(len(tried)), fewer=False):
+            if found.chi.max() < THRESHOLDS.quiet and self.pays(found, before, self.library.charge(len(tried)), fewer=False):
                 return _setting(self.library, tried, variant)
         return None
 
@@ -142,10 +136,10 @@ class _Settings:
         for g in [without(causes, (c,)) for c in causes] if len(causes) > 1 else []:
             gone = 0.0 if exact else float(np.sum(self.fitted(self.library.model, g, self.few, start).residual ** 2))
             own = gone - float(np.sum(whole.residual**2))
-            alike = [v for v, moved in felt if exact or LIKE * own < moved < own / LIKE]
+            alike = [v for v, moved in felt if exact or THRESHOLDS.like_cause * own < moved < own / THRESHOLDS.like_cause]
             out.append(self.rank(alike, g, start, None if exact else whole))
-        if causes and now.chi.max() >= QUIET and not noise(now, SURE):
-            some = [v for v, moved in felt if exact or moved > FALL * size or moved < STILL * size]
+        if causes and now.chi.max() >= THRESHOLDS.quiet and not noise(now, THRESHOLDS.sure_errors):
+            some = [v for v, moved in felt if exact or moved > THRESHOLDS.least_fall * size or moved < THRESHOLDS.still * size]
             out.append(self.rank(some, causes, start))
         return out
 
@@ -163,8 +157,8 @@ class _Settings:
             return _best([t for v in variants if (t := self.fit_under(v, causes, known))])
         near = [t for t in self.near(variants, causes, known) if rival is None or _near(t[1], rival)]
         tried = _best([(v, causes, f) for v, f, _ in near])
-        left = HOPELESS * float(self.fitted(self.library.model, causes, self.few, known).chi.sum())
-        for i, t in enumerate(tried[:CONTENDERS]):
+        left = THRESHOLDS.hopeless_setting * float(self.fitted(self.library.model, causes, self.few, known).chi.sum())
+        for i, t in enumerate(tried[: THRESHOLDS.setting_contenders]):
             if t[2].chi.sum() < left:
                 tried[i] = self.fit_under(t[0], causes, known) or t
         return _best(tried)
@@ -201,7 +195,7 @@ class _Settings:
     def fitted(self, model: Model, causes: Causes, windows: Windows, start: Numbers) -> Fit:
         key = id(model), id(windows), tuple(c.key for c in causes), tuple(sorted(start.items()))
         h = self.bare(model).hypothesis(causes)
-        return once(self._fits, key, lambda: fit(h, windows, theta=numbers(h, start), iterations=SECOND))
+        return once(self._fits, key, lambda: fit(h, windows, theta=numbers(h, start), iterations=THRESHOLDS.second_fit))
 
     def pays(self, new: Fit, old: Fit, charge: float, *, fewer: bool) -> bool:
         """In place of causes only the choice is charged; beside them it pays for itself, on the later windows as well."""
@@ -212,7 +206,7 @@ class _Settings:
         (causes, now), charge = settled.found, self.library.charge(number)
         best: Settled | None = None
         for tried in self.groups(alone, settled.found):
-            for variant, some, first in tried[:FINALISTS]:
+            for variant, some, first in tried[: THRESHOLDS.setting_finalists]:
                 whole = self.fitted(variant.model, some, self.earlier, values(first))
                 if not self.pays(whole, now, charge, fewer=len(some) < len(causes)):
                     continue
@@ -225,11 +219,11 @@ class _Settings:
 
 def _near(fitted: Fit, other: Fit) -> bool:
     """Does a fit that is one step from another simulation's leave as little as the other one, or could, fitted in full?"""
-    return bool(fitted.chi.sum() < CLOSE**2 * other.chi.sum())
+    return bool(fitted.chi.sum() < THRESHOLDS.close_residual**2 * other.chi.sum())
 
 
 def _best(tried: list[Tried]) -> list[Tried]:
-    return sorted(tried, key=lambda t: float(np.sum(np.log(np.maximum(t[2].chi, TINY)))))
+    return sorted(tried, key=lambda t: float(np.sum(np.log(np.maximum(t[2].chi, THRESHOLDS.exact_data)))))
 
 
 def _simpler(sets: FittedSets, found: Found) -> list[Found]:

@@ -10,17 +10,13 @@ from typing import final
 from gapcert_diagnosis.data.dataset import Windows
 from gapcert_diagnosis.fitting.fit import Fit, carried, fit
 from gapcert_diagnosis.fitting.restarts import rescued
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Candidate, Causes, Library, once
 from .criterion import Found, Keys, better, decides, keys, named, noise, numbers, pays, rough_charge, values
 from .effect_size import negligible
 from .gains import Promise
 from .screening import Screen, standing_in
-
-FIRST, SECOND = 4, 6  # iterations of a short fit; of the longer of two
-SHORT = 0.3  # s: windows of the short fits
-CROWD = 100  # candidates from which sets are piled up
-SHAKES = (0.93, 1.05)  # restarts of dry laws that are close to the best, but not yet at the noise
 
 Promised = tuple[list[Promise], list[Promise]]
 
@@ -43,7 +39,7 @@ class FittedSets:
     ) -> None:
         """plain: the fit of nothing, where it is known."""
         self.library, self.windows, self.progress = library, windows, progress
-        self.parts = max(1, windows.length // windows.measured.brief(SHORT))
+        self.parts = max(1, windows.length // windows.measured.brief(THRESHOLDS.short_fit_window))
         self._fits: dict[Keys, Found] = {}
         self._brief: dict[Keys, Fit] = {}
         self._promised: dict[tuple[Keys, tuple[str, str] | None], Promised] = {}
@@ -109,7 +105,7 @@ class FittedSets:
     def fit_shaken(self, causes: Causes, base: Found) -> Fit:
         """The best of a fit and of fresh ones from nearby: sticking puts kinks into the cost, and a fit may catch on one."""
         best, dry = self.fit(causes, base), self.library.dry(causes)
-        for factor in SHAKES if dry and not noise(best) else ():
+        for factor in THRESHOLDS.shakes if dry and not noise(best) else ():
             shaken = {n: v * factor if n in dry else v for n, v in values(best).items()}
             self.fit_again(causes, None, shaken)
         return self._fits[keys(causes)][1]
@@ -117,25 +113,25 @@ class FittedSets:
     def brief(self, base: Found) -> Fit:
         """The set of a long fit, fitted to the short windows."""
         h, theta = base[1].hypothesis, base[1].theta
-        return once(self._brief, keys(base[0]), lambda: fit(h, self.short, theta=theta, iterations=FIRST))
+        return once(self._brief, keys(base[0]), lambda: fit(h, self.short, theta=theta, iterations=THRESHOLDS.first_fit))
 
     def fits(self, base: Found) -> list[tuple[Fit, int]]:
         """Of a set to long and to short windows, and how many of these a long one has."""
         return [(base[1], 1), (self.brief(base), self.parts)]
 
-    def try_move(self, base: Found, s: Promise, iterations: int = FIRST) -> Fit:
+    def try_move(self, base: Found, s: Promise, iterations: int = THRESHOLDS.first_fit) -> Fit:
         """A set with a move more, fitted to the short windows from what is promised."""
         h, brief = self.library.hypothesis((*base[0], *s.move)), self.brief(base)
         theta = numbers(h, values(brief) | dict(s.values))
         return fit(h, self.short, theta=theta, start=brief.start, iterations=iterations)
 
-    def fit_further(self, first: Fit, iterations: int = SECOND) -> Fit:
+    def fit_further(self, first: Fit, iterations: int = THRESHOLDS.second_fit) -> Fit:
         """A fit to the short windows, gone on with."""
         return fit(first.hypothesis, self.short, theta=first.theta, start=first.start, iterations=iterations)
 
     def promises(self, base: Found, instead: Candidate | None = None) -> Promised:
         """All moves by their promise on short and on long windows; of very many those that could stand for `instead`."""
-        key = keys(base[0]), None if instead is None or len(self.library.candidates) < CROWD else instead.key
+        key = keys(base[0]), None if instead is None or len(self.library.candidates) < THRESHOLDS.crowd else instead.key
         if key not in self._promised:
             moves = [m for m in self.library.moves if not keys(m) & key[0]]
             if key[1] is not None:
@@ -150,7 +146,7 @@ class FittedSets:
         known = [p for (k, instead), p in self._promised.items() if k == keys(base[0]) and instead]
         if (found := _first_of(known, c)) is not None:
             return found
-        if not base[0] and len(self.library.candidates) >= CROWD:
+        if not base[0] and len(self.library.candidates) >= THRESHOLDS.crowd:
             # The pile has entered all of them.
             (table,) = self.screen.tables(self.fits(base)[1:], (c,))
             return table.promise((c,))

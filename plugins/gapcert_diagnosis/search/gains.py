@@ -15,16 +15,12 @@ from gapcert.plugin import Array
 from gapcert_diagnosis.data.dataset import Windows, flat
 from gapcert_diagnosis.fitting.fit import Fit
 from gapcert_diagnosis.fitting.linearised import LinearisedMotion, Motion, shortened
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Candidate, Causes, Library
-from .matching_pursuit import ALIKE, Columns, MatchingPursuit, Rows
+from .matching_pursuit import Columns, MatchingPursuit, Rows
 
-STEEP = 1e9  # noise floors
-BLOCK = 0.008  # s
-FREED = (0.5, 2.0)  # times the stated value, where the fit of a number without a tolerance begins
 AT_ONCE = 200  # columns that are pushed along the path together, or little more
-COLUMNS = 1500  # at most that are paired: those that promise most by themselves
-NEAR = (0.6, 1.6)  # the gain of a law that is not linear in any of its numbers must stay near one
 
 
 @final
@@ -78,11 +74,11 @@ class GainTable:
         """The windows of the fit are those of `rows`, each cut into so many parts."""
         self.library, self.fit, self.parts = library, fit, parts
         m, h, scale = windows.measured, fit.hypothesis, 1 / np.sqrt(np.maximum(fit.chi, 0.5))
-        self.whole, block = windows.length // parts * m.repeat, max(1, round(BLOCK / m.period))
+        self.whole, block = windows.length // parts * m.repeat, max(1, round(THRESHOLDS.screening_block / m.period))
         self.steps = self.whole - m.repeat
         self.weigh = (shortened(windows.weight, parts) * scale / m.sigma)[..., None]
         observe = shortened(motion.observe, parts) * self.weigh / math.sqrt(block)
-        self.motion = LinearisedMotion(self._cut(motion.A), observe, m.repeat, block, STEEP)
+        self.motion = LinearisedMotion(self._cut(motion.A), observe, m.repeat, block, THRESHOLDS.steep_column)
         mine = (rows[:, None] * parts + np.arange(parts)).ravel()
         self.residual = flat(self.motion.project(self.motion.blocks((fit.residual[mine] * scale)[..., None])))
         self.slopes = flat(self.motion.project(self._rows(motion.free, motion.shown)))
@@ -205,14 +201,14 @@ class GainTable:
         if len(known) < 2:
             return []
         gains = np.concatenate([self.columns[c.key].gain for c in known])
-        keep = np.sort(np.argsort(-gains, kind="stable")[:COLUMNS])
+        keep = np.sort(np.argsort(-gains, kind="stable")[: THRESHOLDS.paired_columns])
         owner, inner, rows, seen, limits = owner[keep], inner[keep], rows[:, keep], seen[:, keep], limits[keep]
         curve, slope = self._normal_equations(rows, seen)
         gain = _both(curve, slope, limits[:, 0], limits[:, 1])
         clash = np.array([[self.library.related(a, b) for b in known] for a in known])
         gain[clash[np.ix_(owner, owner)]] = 0.0
         size = np.sqrt(np.maximum(np.diag(curve), 1e-300))
-        alike = np.abs(curve / np.outer(size, size)) > ALIKE
+        alike = np.abs(curve / np.outer(size, size)) > THRESHOLDS.alike_columns
         found: list[Promise] = []
         gain = np.triu(gain)
         while len(found) < most and gain.max(initial=0.0) > 0:
@@ -264,7 +260,7 @@ class GainTable:
     def _bounds(self, c: Candidate, values: Array) -> tuple[float, float]:
         k = self.library.amplitude(c)
         if k is None:
-            return NEAR
+            return THRESHOLDS.nonlinear_gain
         off = self.library.off(c)[k]
         low, high = (float((b[k] - off) / (values[k] - off)) for b in self.library.bounds(c))
         return min(low, high), max(low, high)
@@ -297,7 +293,7 @@ class GainTable:
         move = self._inverse(precision, pinned) @ along
         gain = self.precision[k] * self.off[k] ** 2 + along @ move - self.along @ self.inverse @ self.along
         # A straight line says little about a value that is far off; a fit from half or twice the stated one finds it.
-        low, high = np.sort(self.fit.hypothesis.value[k] * np.array(FREED))
+        low, high = np.sort(self.fit.hypothesis.value[k] * np.array(THRESHOLDS.freed_values))
         return Promise((c,), {name: float(np.clip(self.fit.theta[k] - move[k], low, high))}, max(float(gain), 0.0))
 
     def _rows(self, state: Array | None, output: Array | None) -> Array:

@@ -11,12 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.plugin import Array
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Candidate, Library
 
 Rows = npt.NDArray[np.intp]
-ALIKE = 0.98  # cosine of two columns that no screen tells apart
-EVEN = 0.95  # of a law's promise, from which one that it contains is taken instead
 
 
 @final
@@ -53,7 +52,7 @@ class MatchingPursuit:
         self.slope = self.pulled @ along - (rows.T @ residual)[:, 0]
         own = np.einsum("ij,ij->j", rows, rows) - np.einsum("ij,ij->j", seen, seen)
         self.curve = own - np.einsum("ij,ij->i", self.pulled, self.cross)
-        self.least = np.maximum((1 - ALIKE**2) * self.curve, 1e-9)
+        self.least = np.maximum((1 - THRESHOLDS.alike_columns**2) * self.curve, 1e-9)
         self.open = np.ones(len(self.curve), dtype=bool)
         self.picks: list[int] = []
         self._gone: list[Array] = []
@@ -72,7 +71,7 @@ class MatchingPursuit:
             return None
         i = int(np.argmax(gains))
         inside = [o for o, c in enumerate(known) if self.library.within(c, known[int(owner[i])])]
-        kin = np.flatnonzero(np.isin(owner, inside) & (gains > EVEN * gains[i])).tolist()
+        kin = np.flatnonzero(np.isin(owner, inside) & (gains > THRESHOLDS.even_promise * gains[i])).tolist()
         return min([i, *kin], key=lambda k: (self.library.simplicity((known[int(owner[k])],))[0], -gains[k]))
 
     def take(self, i: int) -> None:

@@ -9,30 +9,20 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from gapcert_diagnosis.fitting.fit import Fit, promising
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Candidate, Causes, Library
-from .criterion import TIE, Found, Keys, keys, noise, numbers, rank, scores, values, without
-from .fitted_sets import FIRST, FittedSets
+from .criterion import Found, Keys, keys, noise, numbers, rank, scores, values, without
+from .fitted_sets import FittedSets
 from .gains import Promise
-
-BRIEFLY = 2  # iterations of a short fit that shows whether it is worth the others
-HOPE = 8.0  # promised fall of the squared residual below which nothing is tried
-BY_SHORT, BY_LONG = 8, 4  # candidates that get a short fit
-KEEP, MORE = 4, 2  # candidates that get a full fit; near ties beside them
-CLOSE = 2.0  # times the least squared residual, within which a full fit of dry laws is made again
-BEHIND = 100.0  # score on short windows by which a rival may be worse, and still be as good on long ones
-LOST = 10 * BEHIND  # the same, from which a rival is not fitted to long ones, unless it is the best
-FADED = 0.7  # of the promise of a rival that is far behind: what promises less is not tried
-SLOW = 0.5  # of the best promise, what a law that remembers must promise to be tried in the place of another family's
-LIKELY = 0.3  # of what a cause promises, what a rival of it must promise
-ASTRAY = 1.1  # times the squared residual, from which the first values of a law lead nowhere
-LESS = 8.0  # fall of the squared residual that is not worth a richer law
 
 Tried = tuple[Promise, Fit]
 Option = tuple[Causes, dict[str, float]]
 
 
-def additions(sets: FittedSets, base: Found, instead: Candidate | None = None, hope: float = HOPE) -> list[Found]:
+def additions(
+    sets: FittedSets, base: Found, instead: Candidate | None = None, hope: float = THRESHOLDS.hoped_fall
+) -> list[Found]:
     """Fits of a set with one move more, best first; none where screening promises nothing.
 
     instead: of this cause; where nothing comes near it, the best on short windows.
@@ -52,7 +42,7 @@ def additions(sets: FittedSets, base: Found, instead: Candidate | None = None, h
     least = hope + 2 * math.log(max(1, len(library.candidates)))
     if max((p[0].gain for p in (short, long) if p), default=-math.inf) < least:
         return []
-    few = {keys(s.move): s for s in plain([*long[:BY_LONG], *short[:BY_SHORT]], library)}
+    few = {keys(s.move): s for s in plain([*long[: THRESHOLDS.long_fits], *short[: THRESHOLDS.short_fits]], library)}
     blind = [s for s in stuck(sets, causes, few) if allowed(s.move)]
     picks, known = [*few.values(), *blind], None if instead is None else sets.known((*causes, instead))
     if instead is None or known is None:
@@ -64,11 +54,11 @@ def additions(sets: FittedSets, base: Found, instead: Candidate | None = None, h
             return [((*causes, *s.move), f) for s, f in tried]
     if not tried:
         return []
-    best = finalists(tried, [keys(s.move) for s in long[:MORE]], sets.cautious)
+    best = finalists(tried, [keys(s.move) for s in long[: THRESHOLDS.near_ties]], sets.cautious)
     grown = [((*causes, *s.move), values(sets.fit_further(first))) for s, first in best]
     full = rank([(new, sets.fit(new, base, start)) for new, start in grown], sets.cautious)
     least = (full[0][1] if known is None else known).chi.sum()
-    close = [s for s, f in full if f.chi.sum() < CLOSE * least]
+    close = [s for s, f in full if f.chi.sum() < THRESHOLDS.close_residual * least]
     full = rank([(s, sets.fit_shaken(s, (s, f)) if s in close else f) for s, f in full], sets.cautious)
     if instead is None:
         sets.added[keys(causes)] = full
@@ -82,8 +72,8 @@ def finalists(tried: list[Tried], also: Collection[object], cautious: bool) -> l
         families.setdefault(frozenset((c.effect.family or c.effect.name, c.site) for c in t[0].move), (score, t))
     least, kept = min(score for score, _ in families.values()), list[Tried]()
     for k, (score, t) in enumerate(families.values()):
-        close = k < KEEP + MORE and score < least + TIE
-        if k < KEEP or close or keys(t[0].move) in also:
+        close = k < THRESHOLDS.full_fits + THRESHOLDS.near_ties and score < least + THRESHOLDS.tie_score
+        if k < THRESHOLDS.full_fits or close or keys(t[0].move) in also:
             kept.append(t)
     return kept
 
@@ -91,7 +81,7 @@ def finalists(tried: list[Tried], also: Collection[object], cautious: bool) -> l
 def near(tried: list[Tried], own: Fit, cautious: bool) -> list[Tried]:
     """The best, and those that are not far behind the fit of what they would stand for."""
     mine, *others = scores([own, *(f for _, f in tried)], cautious)
-    least = max(min(others, default=0.0), mine + BEHIND)
+    least = max(min(others, default=0.0), mine + THRESHOLDS.behind_score)
     return [t for t, score in zip(tried, others, strict=True) if score <= least]
 
 
@@ -105,20 +95,20 @@ def replacements(sets: FittedSets, picks: list[Promise], base: Found, instead: C
     most = max((s.gain for s in picks), default=0.0)
     for s in sorted(picks, key=lambda s: library.simplicity(s.move)[0]):
         new, grown = s.move[0], keys((*base[0], *s.move))
-        if 0 < s.gain < FADED * max((t.gain for t in far), default=0.0):
+        if 0 < s.gain < THRESHOLDS.faded_promise * max((t.gain for t in far), default=0.0):
             sets.lost.add(grown)
             continue
         slow = new.effect.family != instead.effect.family and bool(library.extension(new).memory)
-        if slow and (s.gain < SLOW * most or any(library.within(t.move[0], new) for t in far)):
+        if slow and (s.gain < THRESHOLDS.memory_promise * most or any(library.within(t.move[0], new) for t in far)):
             continue
-        first = sets.try_move(base, s, BRIEFLY)
+        first = sets.try_move(base, s, THRESHOLDS.brief_fit)
         behind = sets.better(own, first)
-        if behind <= LOST:
-            first = sets.fit_further(first, FIRST - BRIEFLY)
+        if behind <= THRESHOLDS.lost_score:
+            first = sets.fit_further(first, THRESHOLDS.first_fit - THRESHOLDS.brief_fit)
             behind = sets.better(own, first)
         tried.append((s, first))
-        far += [s] if behind > BEHIND else []
-        sets.lost |= {grown} if behind > LOST else set()
+        far += [s] if behind > THRESHOLDS.behind_score else []
+        sets.lost |= {grown} if behind > THRESHOLDS.lost_score else set()
     return tried
 
 
@@ -127,7 +117,7 @@ def worth(some: list[Promise], promised: Sequence[Promise], instead: Candidate |
     if instead is None:
         return some
     own = next((s.gain for s in promised if keys(s.move) == {instead.key}), 0.0)
-    least = min(LIKELY * own, max((s.gain for s in some), default=0.0))
+    least = min(THRESHOLDS.rival_promise * own, max((s.gain for s in some), default=0.0))
     return [s for s in some if s.gain >= least]
 
 
@@ -164,7 +154,7 @@ def idle(sets: FittedSets, found: Found, new: Causes) -> bool:
         return True
     between = [k for k in sets.library.candidates if sets.library.within(gone[0], k) and sets.library.within(k, come[0])]
     fits = [sets.known(tuple(k if j is gone[0] else j for j in causes)) for k in between]
-    least = float(np.sum(now.residual**2)) - LESS
+    least = float(np.sum(now.residual**2)) - THRESHOLDS.richer_fall
     return bool(fits) and all(f is not None and float(np.sum(f.residual**2)) > least for f in fits)
 
 
@@ -173,7 +163,9 @@ def _astray(sets: FittedSets, found: Found, old: Candidate, come: Candidate, new
     h, names, starts = sets.library.hypothesis(new), sets.library.names(come), sets.library.starts(come)
     known, same = values(found[1]), sets.carry(old, come, found, default=False)
     thetas = [numbers(h, known | dict(zip(names, row, strict=True)) | same) for row in starts.tolist()]
-    return promising(h, sets.windows, np.array(thetas), found[1].start)[2] > ASTRAY * float(np.sum(found[1].residual ** 2))
+    return promising(h, sets.windows, np.array(thetas), found[1].start)[2] > THRESHOLDS.astray * float(
+        np.sum(found[1].residual ** 2)
+    )
 
 
 def swaps(sets: FittedSets, found: Found) -> list[Option]:
@@ -184,7 +176,7 @@ def swaps(sets: FittedSets, found: Found) -> list[Option]:
     """
     library, (causes, now) = sets.library, found
     n = now.residual.shape[0] * now.residual.shape[1]
-    left = float(np.sum(now.whiteness * n * np.log(np.maximum(now.chi, 1.0)))) > 2 * TIE
+    left = float(np.sum(now.whiteness * n * np.log(np.maximum(now.chi, 1.0)))) > 2 * THRESHOLDS.tie_score
     out: dict[Keys, Option] = {}
     for c in causes:
         for e in library.candidates:
@@ -193,7 +185,7 @@ def swaps(sets: FittedSets, found: Found) -> list[Option]:
             certain = library.contains(c.effect.name, e.effect.name) or library.richer(e, c)
             family = bool(c.effect.family) and c.effect.family == e.effect.family
             kin = family or library.contains(e.effect.name, c.effect.name)
-            if certain or (kin and (left or ((s := sets.promise(found, e)) is not None and s.gain > TIE))):
+            if certain or (kin and (left or ((s := sets.promise(found, e)) is not None and s.gain > THRESHOLDS.tie_score))):
                 alike = _alike(sets, causes, c)
                 for where in ((c,), alike) if certain and len(alike) > 1 else ((c,),):
                     new, start = _swapped(sets, found, where, e)

@@ -19,15 +19,12 @@ from gapcert.plugin import Array, Model, difference
 from gapcert_diagnosis.data.dataset import Windows
 from gapcert_diagnosis.fitting.fit import Fit
 from gapcert_diagnosis.fitting.linearised import Motion, Path
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Candidate, Causes, Library, once
-from .gains import BLOCK, GainTable, Promise, Push
+from .gains import GainTable, Promise, Push
 
-SAMPLES = 5_000  # at most: more windows than that say nothing new about which candidates to try
-FINER, MANY = 7, 4  # points of a local scan, and starts of one number from which a scan between them pays
 ROWS = 512  # motions that are stepped together: more no longer stay near the processor
-SCANNED = 12  # moves that promise most
-LOOSELY, FEW = 0.1, 4  # of what a cause promises, what could stand for it must promise; how many are taken in any case
 
 
 @final
@@ -36,7 +33,7 @@ class Screen:
 
     def __init__(self, library: Library, windows: Windows, guess: Fit, tell: Callable[[str], None] = lambda text: None) -> None:
         self.tell = tell
-        few = max(1, SAMPLES // windows.length)
+        few = max(1, THRESHOLDS.screened_samples // windows.length)
         rows = np.arange(len(windows))
         if len(rows) > few:
             rows = np.unique(np.linspace(0, len(windows) - 1, few).astype(int))
@@ -86,7 +83,7 @@ class Screen:
     def _moved(self, model: Model, given: Mapping[str, Array], count: int) -> Array:
         """What parameters add to one step along the path, (W, S, nx, count)."""
         m, (w, steps, nx) = self.windows.measured, self.path.x[:, self.path.lead :].shape
-        every = 1 if m.exact or model.hidden else m.repeat * max(1, round(BLOCK / m.period))
+        every = 1 if m.exact or model.hidden else m.repeat * max(1, round(THRESHOLDS.screening_block / m.period))
         moved, some, off = np.empty((w, steps, nx, count)), max(1, ROWS // w), ("off", id(model))
         for k in range(0, count, some):
             part = {n: v[k : k + some] for n, v in given.items()}
@@ -129,9 +126,9 @@ class Screen:
         out = []
         for table in self.tables(fits, dict.fromkeys(c for move in moves for c in move)):
             found = _sorted(table, moves)
-            best = [s.move for s in found[:SCANNED]]
+            best = [s.move for s in found[: THRESHOLDS.scanned_moves]]
             self._scan(table, dict.fromkeys(c for move in best for c in move))
-            out.append(_sorted(table, best) + found[SCANNED:])
+            out.append(_sorted(table, best) + found[THRESHOLDS.scanned_moves :])
         return out
 
     def tables(self, fits: Sequence[tuple[Fit, int]], candidates: Collection[Candidate] | None = None) -> Iterator[GainTable]:
@@ -159,8 +156,8 @@ def standing_in(moves: Sequence[Causes], gains: Mapping[tuple[str, str], float],
 
     Those without a column, which lift the tolerance of a number that is free already, cost nothing to ask.
     """
-    best = sorted(gains, key=lambda k: -gains[k])[:FEW]
-    near = {k for k, gain in gains.items() if gain > LOOSELY * gains.get(cause, 0.0)}
+    best = sorted(gains, key=lambda k: -gains[k])[: THRESHOLDS.loose_rivals]
+    near = {k for k, gain in gains.items() if gain > THRESHOLDS.loose_promise * gains.get(cause, 0.0)}
     kept = {*near, *best, cause}
     return [m for m in moves if len(m) == 1 and (m[0].key in kept or m[0].key not in gains)]
 
@@ -180,12 +177,12 @@ def _distinct(values: Array, amplitude: int | None) -> Array:
 
 def _between(values: Array, best: Array, amplitude: int | None) -> Array:
     """Points about the best of many values of one number, where an effect is a needle; none where there are few values."""
-    rest = [k for k in range(values.shape[1]) if k != amplitude and len(np.unique(values[:, k])) >= MANY]
+    rest = [k for k in range(values.shape[1]) if k != amplitude and len(np.unique(values[:, k])) >= THRESHOLDS.scanned_starts]
     if len(rest) != 1:
         return values[:0]
     (k,) = rest
     known = np.unique(values[:, k])
     at = int(np.searchsorted(known, best[k]))
-    out = np.tile(best, (FINER, 1))
-    out[:, k] = np.linspace(known[max(at - 1, 0)], known[min(at + 1, len(known) - 1)], FINER + 2)[1:-1]
+    out = np.tile(best, (THRESHOLDS.finer_scan, 1))
+    out[:, k] = np.linspace(known[max(at - 1, 0)], known[min(at + 1, len(known) - 1)], THRESHOLDS.finer_scan + 2)[1:-1]
     return out

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any, Protocol, TypeVar
 
-MOST = 3  # moves; more than that are stand-ins for a law that the library lacks
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
 S = TypeVar("S")
 
@@ -48,7 +48,7 @@ def forward(sets: Selection[S], width: int = 1, enough: Callable[[S], bool] = la
     """
     best = sets.nothing
     beam = [best]
-    for _ in range(MOST):
+    for _ in range(THRESHOLDS.most_moves):
         grown = {sets.key(found): found for parent in beam for found in sets.grow(parent, width)}
         new = [f for f in sets.rank(list(grown.values())) if sets.key(f) != sets.key(best)]
         if not new or not sets.outdoes(new[0], best):

@@ -9,18 +9,13 @@ import numpy as np
 
 from gapcert.plugin import Array
 from gapcert_diagnosis.fitting.fit import Fit
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Candidate, Causes, Library
-from .criterion import SMALL, SURE, Found, Keys, beats, keys, margin, noise, outdoes, rank, values, without
-from .fitted_sets import CROWD, FittedSets
+from .criterion import Found, Keys, beats, keys, margin, noise, outdoes, rank, values, without
+from .fitted_sets import FittedSets
 from .moves import additions, idle, merges, spared, swaps
-from .selection import MOST, drop, forward
-
-ALONE = 0.5  # share of what a pile promises, that the best of its candidates promises by itself at most
-BEAM = 3  # sets that are grown at once while more than noise is left
-PAIRS = 6  # of the largest promise on long and on short windows, that get a short fit
-FULL = 2  # that get a full one
-SHARE = 0.6  # of what was found, below which no pair promises to explain as much
+from .selection import drop, forward
 
 
 @final
@@ -52,7 +47,7 @@ class EquationSearch:
         best = forward(self)
         if not best[0] or self.enough(best):
             return best
-        small, large = sorted([best, forward(self, BEAM, self.enough)], key=lambda f: len(f[0]))
+        small, large = sorted([best, forward(self, THRESHOLDS.beam, self.enough)], key=lambda f: len(f[0]))
         return large if self.outdoes(large, small) else small
 
     def key(self, found: Found) -> Keys:
@@ -85,14 +80,14 @@ class EquationSearch:
     def try_piles(self) -> Found | None:
         """Of very many candidates a few that screening piles up, if they leave noise, and no single one promises much of it."""
         sets, base = self.sets, self.nothing
-        if len(sets.library.candidates) < CROWD:
+        if len(sets.library.candidates) < THRESHOLDS.crowd:
             return None
         for table in sets.screen.tables(sets.fits(base)[::-1]):
-            piles = table.pursue(MOST)
-            if piles and piles[0].gain < ALONE * piles[-1].gain:
+            piles = table.pursue(THRESHOLDS.most_moves)
+            if piles and piles[0].gain < THRESHOLDS.alone_promise * piles[-1].gain:
                 grown = piles[-1].move
                 new = self.refine((grown, sets.fit(grown, base, values(sets.try_move(base, piles[-1])))))
-                if noise(new[1], SURE) and sets.pays(new, base) and sets.matters(new):
+                if noise(new[1], THRESHOLDS.sure_errors) and sets.pays(new, base) and sets.matters(new):
                     self.piled = keys(new[0])
                     return new
         return None
@@ -105,16 +100,16 @@ class EquationSearch:
         if keys(found[0]) == self.piled:
             return found  # of all candidates at once, and noise is left
         sets, nothing, now = self.sets, self.nothing, self.sets.brief(found)
-        promised = [s for table in sets.screen.tables(sets.fits(nothing)) for s in table.pairs(PAIRS)]
+        promised = [s for table in sets.screen.tables(sets.fits(nothing)) for s in table.pairs(THRESHOLDS.paired_short_fits)]
         most = max((s.gain for s in promised), default=0.0)
-        silent = noise(found[1], SURE) and bool(found[0])
-        if most < (SHARE * self._explained(found[1]) if silent else 2 * sets.library.threshold):
+        silent = noise(found[1], THRESHOLDS.sure_errors) and bool(found[0])
+        if most < (THRESHOLDS.paired_share * self._explained(found[1]) if silent else 2 * sets.library.threshold):
             return found
         now = sets.fit_further(now)
         moves = {keys(s.move): s for s in reversed(promised)}
         tried = rank([(s.move, sets.try_move(nothing, s)) for s in moves.values()])
         best = found
-        for causes, first in tried[:FULL]:
+        for causes, first in tried[: THRESHOLDS.paired_full_fits]:
             if beats(first, now, sets.cautious, fewer=len(causes) < len(best[0])):
                 new = self.refine((causes, sets.fit(causes, nothing, values(sets.fit_further(first)))))
                 more = beats(new[1], best[1], sets.cautious, fewer=len(new[0]) < len(best[0]))
@@ -149,7 +144,7 @@ class EquationSearch:
         """Without all causes at once that the fit, to second order, loses little without; with half of these, where it does."""
         causes, now = found
         order, lost = lightest(self.sets.library, causes, now)
-        small = order[: int(np.searchsorted(lost, SMALL))]
+        small = order[: int(np.searchsorted(lost, THRESHOLDS.small_gain))]
         while len(small) > 1:
             rest = without(causes, small)
             if rest and not self.sets.pays(found, (rest, fitted := self.sets.fit(rest, found))):

@@ -9,15 +9,13 @@ import numpy as np
 from gapcert.plugin import Array
 from gapcert_diagnosis.data.dataset import Windows
 from gapcert_diagnosis.fitting.fit import Fit, fit, followed
+from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Library
-from .criterion import SURE, TIE, Found, agrees, better, fails, noise, values, without
+from .criterion import Found, agrees, better, fails, noise, values, without
 from .fitted_sets import FittedSets, untold
 from .moves import additions
 from .stepwise import EquationSearch
-
-CALM = 1.02  # times the residual of the earlier windows that a law of the later ones may make of it
-ADEQUATE = 1.2  # residual per noise floor of later data that no simpler law has to improve
 
 
 def search_windows(
@@ -34,11 +32,11 @@ def search_windows(
     causes, fitted = first[1]
     other = windows.with_hold("first")
     again = fit(fitted.hypothesis, other.guard()[0], theta=fitted.theta)
-    if better(again, fitted) <= TIE:
+    if better(again, fitted) <= THRESHOLDS.tie_score:
         return first
     second = _guarded(library, other, progress)
     fewer = len(second[1][0]) < len(causes)
-    return second if better(second[1][1], fitted) > (-TIE if fewer else TIE) else first
+    return second if better(second[1][1], fitted) > (-THRESHOLDS.tie_score if fewer else THRESHOLDS.tie_score) else first
 
 
 def _guarded(
@@ -48,7 +46,7 @@ def _guarded(
     sets = FittedSets(library, earlier, progress, plain)
     search = EquationSearch(sets)
     found = drop_unconfirmed(sets, search.select(), later)
-    if noise(found[1], SURE) and not noise(judge(found[1], later), SURE):
+    if noise(found[1], THRESHOLDS.sure_errors) and not noise(judge(found[1], later), THRESHOLDS.sure_errors):
         # Near the noise of the earlier windows by chance, or by a stand-in.
         search.thorough = True
         found = drop_unconfirmed(sets, search.select(), later)
@@ -64,7 +62,7 @@ def _events(sets: FittedSets, found: Found, windows: Windows, known: float) -> F
     before = np.maximum(judge(base[1], sets.windows).chi, 1.0)
     for causes, fitted in additions(whole, base):
         silent = all(whole.screen.silent(c, values(fitted), known) for c in without(causes, base[0]))
-        calm = silent or (judge(fitted, sets.windows).chi < CALM * before).all()
+        calm = silent or (judge(fitted, sets.windows).chi < THRESHOLDS.calm_residual * before).all()
         if calm and whole.pays((causes, fitted), base) and whole.matters((causes, fitted)):
             return causes, sets.fit(causes, found, values(fitted))
     return found
@@ -79,7 +77,7 @@ def drop_unconfirmed(sets: FittedSets, found: Found, guard: Windows) -> Found:
     if not confirms(now, sets.nothing, guard, own):
         left = [(rest, sets.fit(rest, found)) for rest in (without(causes, (c,)) for c in causes)]
         return drop_unconfirmed(sets, min(left, key=lambda f: float(judge(f[1], guard).chi.sum())), guard)
-    adequate = own.chi.max() < ADEQUATE
+    adequate = own.chi.max() < THRESHOLDS.adequate_residual
     for c in reversed(causes):
         rest = without(causes, (c,))
         fitted = sets.fit(rest, found)

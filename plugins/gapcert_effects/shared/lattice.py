@@ -5,11 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gapcert import Array
-
-CELLS = 64  # of the range, each with the same say: a joint that rests for long is no lattice
-FEWEST, COARSEST, OFTEN = 6, 4.0, 8  # levels; steps over the range; times that each of a few exact levels comes again
-FINE, WIDE = 2.0, 100.0  # a step in noise floors: finer ones drown in the noise
-BINS = 1 << 16
+from gapcert_effects.thresholds import THRESHOLDS
 
 
 def lattice(values: Array) -> float | None:
@@ -22,16 +18,18 @@ def lattice(values: Array) -> float | None:
         return step
     floor = float(np.sqrt(np.mean(np.diff(y, 4) ** 2) / 70)) if len(y) > 50 else 0.0
     reach = float(np.ptp(y)) if len(y) else 0.0
-    if not (floor > 0 and reach > COARSEST * FINE * floor):
+    if not (floor > 0 and reach > THRESHOLDS.lattice_coarsest * THRESHOLDS.lattice_finest * floor):
         return None
-    cell = np.minimum(((y - y.min()) / reach * CELLS).astype(int), CELLS - 1)
-    count = np.bincount(cell, minlength=CELLS)
+    cell = np.minimum(((y - y.min()) / reach * THRESHOLDS.lattice_cells).astype(int), THRESHOLDS.lattice_cells - 1)
+    count = np.bincount(cell, minlength=THRESHOLDS.lattice_cells)
     levels = int(np.count_nonzero(count))
-    if levels < FEWEST:
+    if levels < THRESHOLDS.lattice_levels:
         return None
     weight = 1.0 / (levels * count[cell])
     frequency, found = _spectrum(y, weight, reach, floor)
-    inside = (frequency >= max(COARSEST / reach, 1 / (WIDE * floor))) & (frequency <= 1 / (FINE * floor))
+    inside = (frequency >= max(THRESHOLDS.lattice_coarsest / reach, 1 / (THRESHOLDS.lattice_widest * floor))) & (
+        frequency <= 1 / (THRESHOLDS.lattice_finest * floor)
+    )
     peaks = np.where(inside, found, 0.0)
     # The largest of some thousand sums of `levels` random phases stays below 2.8/√levels.
     if peaks.max() < min(0.98, 0.1 + 2.8 / np.sqrt(levels)):
@@ -45,18 +43,18 @@ def lattice(values: Array) -> float | None:
 def _exact(y: Array) -> float | None:
     """The step of a few values that come again and again, where all of them are whole multiples of it apart."""
     levels = np.unique(np.round(y, 12))
-    if not 3 <= len(levels) <= len(y) / OFTEN:
+    if not 3 <= len(levels) <= len(y) / THRESHOLDS.lattice_repeats:
         return None
     apart = np.diff(levels)
     ratio = apart / apart.min()
     step = float(np.ptp(levels) / np.round(ratio).sum())
-    coarse = step > FINE * float(np.sqrt(np.mean(np.diff(y, 4) ** 2) / 70))
+    coarse = step > THRESHOLDS.lattice_finest * float(np.sqrt(np.mean(np.diff(y, 4) ** 2) / 70))
     return step if coarse and np.abs(ratio - np.round(ratio)).max() < 1e-3 else None
 
 
 def _spectrum(y: Array, weight: Array, reach: float, floor: float) -> tuple[Array, Array]:
     """(frequencies, |Σ w exp(2πi f y)|) by one transform of a fine histogram."""
-    bins = int(min(BINS, np.ceil(reach / (0.2 * floor))))
+    bins = int(min(THRESHOLDS.lattice_bins, np.ceil(reach / (0.2 * floor))))
     width = reach / bins
     at = np.minimum(((y - y.min()) / width).astype(int), bins - 1)
     total = np.bincount(at, weight, minlength=bins)

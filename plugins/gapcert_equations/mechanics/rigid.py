@@ -15,9 +15,9 @@ from gapcert_equations.config import EquationsConfig
 from gapcert_equations.text import checks, units
 from gapcert_equations.text.sympy_text import symbol
 from gapcert_equations.text.units import ACCELERATION, METRE
+from gapcert_equations.thresholds import THRESHOLDS
 
 STANDARD_GRAVITY = 9.80665
-_SMALL = 100
 
 Read = Callable[[str, str], Any]
 
@@ -90,7 +90,7 @@ def _along(row: Sequence[Any], v: Sequence[Any]) -> Any:
 
 def _tidy(e: Any) -> Any:
     """Products of sines as sines of sums, so that sin² + cos² = 1, where that is quick and makes it shorter."""
-    if sympy.count_ops(e) > _SMALL:
+    if sympy.count_ops(e) > THRESHOLDS.expanded_operations:
         return e
     shorter = sympy.expand(TR8(sympy.expand(e)))
     return shorter if sympy.count_ops(shorter) <= sympy.count_ops(e) else e

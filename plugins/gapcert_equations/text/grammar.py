@@ -15,6 +15,7 @@ from keyword import iskeyword
 from typing import final
 
 from gapcert import UsageError
+from gapcert_equations.thresholds import THRESHOLDS
 
 FUNCTIONS: dict[str, Callable[..., float]] = {
     "sin": math.sin,
@@ -33,7 +34,6 @@ FUNCTIONS: dict[str, Callable[..., float]] = {
     "min": min,
     "max": max,
 }
-MAX_LENGTH, MAX_DEPTH, MAX_EXPONENT, MAX_ARGUMENTS = 20_000, 150, 64, 8
 _STRANGE = re.compile(r"[^\w\s+\-*/().,]")
 _HINTS = {"^": "write ** for powers", "=": "write only the right-hand side", "'": "no text", '"': "no text"}
 
@@ -58,8 +58,8 @@ def parse(text: str) -> ast.expr:
     """
     if not text.strip():
         raise ExpressionError("the expression is empty; write one such as -k*q")
-    if len(text) > MAX_LENGTH:
-        raise ExpressionError(f"the expression has {len(text)} characters; at most {MAX_LENGTH} are allowed")
+    if len(text) > THRESHOLDS.characters:
+        raise ExpressionError(f"the expression has {len(text)} characters; at most {THRESHOLDS.characters} are allowed")
     if (strange := _STRANGE.search(text)) is not None:
         hint = _HINTS.get(strange[0], "use numbers, names, + - * / ** and " + ", ".join(FUNCTIONS))
         raise ExpressionError(f"'{strange[0]}' is not allowed here; {hint}", strange.start())
@@ -90,7 +90,7 @@ def _check(node: ast.expr, depth: int) -> float | None:
 
 
 def _fold(node: ast.expr, depth: int) -> float | None:
-    if depth > MAX_DEPTH:
+    if depth > THRESHOLDS.depth:
         raise ExpressionError("the expression is nested too deeply; write it flatter", node.col_offset)
     if isinstance(node, ast.Constant) and isinstance(number := node.value, int | float) and not isinstance(number, bool):
         return _finite(node, lambda: float(number))
@@ -112,8 +112,8 @@ def _fold(node: ast.expr, depth: int) -> float | None:
 def _check_binary(node: ast.BinOp, depth: int) -> float | None:
     left, right = _check(node.left, depth + 1), _check(node.right, depth + 1)
     if isinstance(node.op, ast.Pow):
-        if right is not None and abs(right) > MAX_EXPONENT:
-            raise ExpressionError(f"the exponent {right:g} is too large; at most {MAX_EXPONENT}", node.right.col_offset)
+        if right is not None and abs(right) > THRESHOLDS.exponent:
+            raise ExpressionError(f"the exponent {right:g} is too large; at most {THRESHOLDS.exponent}", node.right.col_offset)
         # Only a constant base can grow while it is read.
         return None if left is None or right is None else _finite(node, lambda: left**right)
     if isinstance(node.op, ast.Div):
@@ -131,7 +131,7 @@ def _check_call(node: ast.Call, name: str, depth: int) -> float | None:
         raise ExpressionError(f"unknown function '{name}'; {near(name, FUNCTIONS)}", node.col_offset)
     if node.keywords or any(isinstance(a, ast.Starred) for a in node.args):
         raise ExpressionError(f"{name} takes plain arguments only", node.col_offset)
-    low, high = (2, MAX_ARGUMENTS) if name in ("min", "max") else (1, 1)
+    low, high = (2, THRESHOLDS.arguments) if name in ("min", "max") else (1, 1)
     if not low <= len(node.args) <= high:
         wanted = f"{low} to {high} arguments" if high > 1 else "one argument"
         raise ExpressionError(f"{name} has {len(node.args)} arguments; expected {wanted}", node.col_offset)

@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 from gapcert import Parameter
 from gapcert_equations.config import EquationsConfig, OutputConfig, Softness
+from gapcert_equations.thresholds import THRESHOLDS
 
 from .sympy_text import expression, symbol, written
 
 if TYPE_CHECKING:
     from gapcert_equations.mechanics.rigid import Terms
-
-_LONG = 400
 
 
 def readable(config: EquationsConfig, parameters: Sequence[Parameter]) -> str:
@@ -91,7 +90,7 @@ def _printable(config: EquationsConfig) -> tuple[EquationsConfig, list[str]]:
         return config.model_copy(update=bare), [f"gravity is turned by {angle} along {q}" for q, angle in config.tilt.items()]
     m = _terms(config)
     bare = {"payload": {}, "tilt": {}}
-    if sympy.count_ops([*m.bias, *m.forces, *(e for row in m.mass for e in row)]) > _LONG:
+    if sympy.count_ops([*m.bias, *m.forces, *(e for row in m.mass for e in row)]) > THRESHOLDS.printed_operations:
         lines = [f"{m} is carried at ({', '.join(config.points[q])}), the point of {q}" for q, m in config.payload.items()]
         lines += [f"gravity is turned by {angle} along {q}" for q, angle in config.tilt.items()]
         return config.model_copy(update=bare), lines

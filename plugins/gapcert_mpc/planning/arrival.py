@@ -10,14 +10,11 @@ import numpy as np
 
 from gapcert import Array
 from gapcert_mpc.program.corridors import Scene, read
-from gapcert_mpc.program.program import LOOSE
+from gapcert_mpc.thresholds import THRESHOLDS
 
 from .engine import Engine
 from .plans import Held, Plan, Pool
 from .search import Search
-
-TRIED = 6  # known plans whose corridors a start tries
-NODES = 500  # of the tree of a search: a start from which nothing is found in so many is taken as one without a plan
 
 
 @final
@@ -32,7 +29,7 @@ class Arrival:
         self.engine, self.scene, self.program = engine, scene, engine.program
         self.pool = pool or Pool.of([], self.program)
         self.low, self.high = self.program.limits()
-        self.search = Search(self.program, scene, NODES)
+        self.search = Search(self.program, scene, THRESHOLDS.tree_nodes)
 
     def solve(self, x: Array, held: Held | None) -> Plan | None:
         return self.follow(x, held.plan, held.age) if held else self.begin(x)
@@ -53,7 +50,7 @@ class Arrival:
 
     def known(self, x: Array) -> Plan | None:
         """A plan from x (frame) in one of the nearest corridors of the pool."""
-        for i, k in self.pool.near(x, TRIED):
+        for i, k in self.pool.near(x, THRESHOLDS.tried_plans):
             found = self._along(x, self.pool.x[i, k:], self.pool.s[i, k:], int(self.pool.arrival[i]) - k, None)
             if found is not None:
                 return found
@@ -76,7 +73,7 @@ class Arrival:
         value, reach = read(p, at[: arrival + 1], s[: arrival + 1])
         t = int(self.scene.inside(value[-1:], reach[-1:])[0].argmax())
         between = self.scene.corridor(value, reach)
-        low, high = (np.full_like(self.low, b) for b in (-LOOSE, LOOSE))
+        low, high = (np.full_like(self.low, b) for b in (-THRESHOLDS.loose_bound, THRESHOLDS.loose_bound))
         k, states = arrival + 1, ~p.driven
         low[:k, states] = np.maximum(self.low[:k], between[0])[:, states]
         high[:k, states] = np.minimum(self.high[:k], between[1])[:, states]

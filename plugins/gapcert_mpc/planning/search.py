@@ -13,11 +13,8 @@ from gapcert import Array
 from gapcert.plugin import Ints
 from gapcert_engines import muted
 from gapcert_mpc.program.corridors import Scene
-from gapcert_mpc.program.program import LOOSE, Program
-
-AFTER = 4.0  # half-ranges by which a state or input may leave its own after arrival
-ROUNDS = 5  # with a tube that is given
-EFFORT = 1e-3  # of one input over its half-range for one step, in steps to arrival
+from gapcert_mpc.program.program import Program
+from gapcert_mpc.thresholds import THRESHOLDS
 
 
 def optimum(
@@ -38,7 +35,7 @@ def optimum(
 
 @final
 class Search:
-    """minimise arrival + EFFORT Σ|ū| over the plans of a program, tubes included.
+    """minimise arrival + `effort_weight` Σ|ū| over the plans of a program, tubes included.
 
     Binaries: y_kt, the plan arrives at stage k in target t, Σ y = 1; δ_kf, the tube of stage k is beyond face f, at least one
     of each obstacle up to arrival. Their rows are those of the program with other bounds, loosened where the binary is 0 by as
@@ -56,7 +53,7 @@ class Search:
             kept[rows[rows >= 0]] = False
         self.plain = np.flatnonzero(kept)
         low, high = p.limits()
-        self.low, self.high = np.maximum(low, -LOOSE), np.minimum(high, LOOSE)
+        self.low, self.high = np.maximum(low, -THRESHOLDS.loose_bound), np.minimum(high, THRESHOLDS.loose_bound)
         # What rows reach at most: those of the goal, or, where these ask nothing, those of the frame.
         most = np.minimum(self.high, np.abs(p.whole).sum(axis=1)), np.maximum(self.low, -np.abs(p.whole).sum(axis=1))
         self.most = {1: most[0], -1: -most[1]}
@@ -84,7 +81,7 @@ class Search:
         L, off = self._at(k, row, side)
         loose = np.maximum(self.most[side][k, row] - bound, 0.0)
         M = sp.hstack([L, sp.csr_matrix((len(k), self.columns - L.shape[1]))], format="csr")
-        M = M - AFTER * self._before(free)
+        M = M - THRESHOLDS.after_arrival * self._before(free)
         if binary is not None:
             M = M + sp.csr_matrix((loose, (np.arange(len(k)), binary)), shape=M.shape)
             bound = bound + loose
@@ -93,7 +90,7 @@ class Search:
     def _inequalities(self) -> None:
         p, scene, N = self.program, self.scene, self.N
         for side, rows, limit in ((1, p.upper, self.high), (-1, p.lower, -self.low)):
-            k, row = np.argwhere((rows >= 0) & (limit < LOOSE)).T
+            k, row = np.argwhere((rows >= 0) & (limit < THRESHOLDS.loose_bound)).T
             self._add(k, row, side, limit[k, row], None, k + p.driven[row])
             for t in range(self.T):
                 bound = scene.high[t] if side > 0 else -scene.low[t]
@@ -125,7 +122,7 @@ class Search:
         high = np.concatenate([p.high[self.plain], [1.0], above])
         cost, kind = np.zeros(self.columns), np.zeros(self.columns)
         cost[self.y0 : self.d0] = np.repeat(np.arange(1, N + 1), T)
-        cost[self.e0 :] = EFFORT
+        cost[self.e0 :] = THRESHOLDS.effort_weight
         kind[self.y0 : self.e0] = 1
         least, most = np.full(self.columns, -np.inf), np.full(self.columns, np.inf)
         least[self.y0 : self.e0], most[self.y0 : self.e0] = 0, 1
@@ -143,7 +140,7 @@ class Search:
         """
         p = self.program
         tube = last = p.tube(np.zeros((p.N + 1, len(p.F)))) if p.variable else p.constant
-        for i in range(ROUNDS if p.variable else 0):
+        for i in range(THRESHOLDS.tube_rounds if p.variable else 0):
             found = self.solved(x, tube)
             if found is not None:
                 yield found[0], found[1], found[2]

@@ -11,17 +11,11 @@ from gapcert import Array
 from gapcert.plugin import Bools
 from gapcert_mpc.program.linearise import Frame, Nominal, Stages
 from gapcert_mpc.program.tube import Section, tightest
+from gapcert_mpc.thresholds import THRESHOLDS
 
 from .design import Design
 from .engine import Engine
 from .plans import Held, Plan
-
-FLOORS = (0.06, 0.02, 0.15)  # of the half-ranges: by how much a plan may move beyond its tube, in turns
-SPARE = 1.2  # of the tube: by how much it may grow
-KEPT, WIDER = 0.4, 1.6  # of the boxes that a plan would get: lines are kept while theirs are not narrower, nor wider
-ROUNDS = 4
-VARIES = 1e-9  # of half-ranges: slopes that change by less count as constant
-TRUSTED = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15, 0.1)  # half-widths that are tried for the terminal box
 
 
 @final
@@ -43,10 +37,10 @@ class Ending:
         """
         one = np.ones((1, len(wanted)))
         whole = nominal.along(frame, 0 * one, -one, one)
-        on = (whole.G[0] > VARIES).any(axis=0)
+        on = (whole.G[0] > THRESHOLDS.constant_slope).any(axis=0)
         z = steady(nominal, frame, wanted, matter)
         best: tuple[tuple[bool, float], Ending] | None = None
-        for size in TRUSTED:
+        for size in THRESHOLDS.terminal_sizes:
             radius = np.where(on, size, 2.0)
             last = nominal.along(frame, z, np.maximum(z - radius, -1.0), np.minimum(z + radius, 1.0)).only(on)
             room = np.maximum(np.minimum(last.high - z, z - last.low)[0], 1e-3)
@@ -107,12 +101,12 @@ class Lines:
         N, n = len(z), self.frame.nx
         take = np.append(np.minimum(np.arange(N) + by, N - 1), N)
         low, high = old.low[take[:-1]], old.high[take[:-1]]
-        need = np.where(self.on, KEPT * radius, 0.0)
+        need = np.where(self.on, THRESHOLDS.line_narrowest * radius, 0.0)
         need[0, :n] = 0.0
         z = np.clip(z, -1.0, 1.0)
         z[0, :n] = x
         inside = (np.maximum(z - need, -1.0) >= low).all() and (np.minimum(z + need, 1.0) <= high).all()
-        wide = ((high - low) > WIDER * 2 * radius)[1:, self.on].any()
+        wide = ((high - low) > THRESHOLDS.line_widest * 2 * radius)[1:, self.on].any()
         return old.taken(take) if inside and not wide else None
 
     def tangents(self, x: Array, z: Array, radius: Array) -> Stages:
@@ -131,7 +125,7 @@ class Lines:
     def radius(self, s: Array, floor: float) -> Array:
         """(N, n + m): what a tube s (≥ N, p) and a plan that moves by `floor` need."""
         N = len(s)
-        return np.asarray(floor + SPARE * s[:N] @ self.section.support.T)
+        return np.asarray(floor + THRESHOLDS.tube_growth * s[:N] @ self.section.support.T)
 
 
 def tube(stages: Stages, section: Section, tolerance: float, x: Array, u: Array) -> Array:
@@ -182,7 +176,7 @@ class Successive:
         for row in z:
             row += np.concatenate([away, section.K @ away])
             away = section.closed @ away
-        floor = FLOORS[age % len(FLOORS)]
+        floor = THRESHOLDS.move_floors[age % len(THRESHOLDS.move_floors)]
         if age == 0 and plan.lines is not None:
             old = self.lines.again(x, z, self.lines.radius(plan.s[:-1], floor), plan.lines, 1)
             made = None if old is None else self._along(x, old)
@@ -211,7 +205,7 @@ class Successive:
         z = self._searched(x, self._straight(x))
         if z is None:
             return None
-        for floor in FLOORS:
+        for floor in THRESHOLDS.move_floors:
             s = np.zeros((len(z) + 1, self.engine.program.p))
             # The tube needs the boxes, and they need the tube.
             for _ in range(2):
@@ -224,13 +218,13 @@ class Successive:
 
     def _searched(self, x: Array, z: Array) -> Array | None:
         """z (N, n + m) of a plan from there: quadratic programs with the slopes at the last one's answer."""
-        for _ in range(ROUNDS):
+        for _ in range(THRESHOLDS.linearisation_rounds):
             found = self._found(x, self.lines.tangents(x, z, np.ones_like(z)))
             if found is None:
                 return None
             then = np.hstack([found.x[:-1], found.u])
             moved, z = float(np.abs(then - z)[:, self.lines.on].max(initial=0.0)), then
-            if moved < FLOORS[0]:
+            if moved < THRESHOLDS.move_floors[0]:
                 break
         return z
 

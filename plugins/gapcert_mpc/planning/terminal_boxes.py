@@ -10,7 +10,7 @@ import numpy as np
 
 from gapcert import Array
 from gapcert.plugin import Bools
-from gapcert_mpc.program.program import LOOSE
+from gapcert_mpc.thresholds import THRESHOLDS
 
 from .design import Ends
 from .engine import Engine
@@ -56,7 +56,7 @@ class Landing:
         """To the first of the boxes tried that there is a plan of so many steps to."""
         p = self.engine.program
         after = np.arange(self.horizon + 1)[:, None] >= steps + ~p.driven
-        low, high = np.where(after, -LOOSE, self.low), np.where(after, LOOSE, self.high)
+        low, high = np.where(after, -THRESHOLDS.loose_bound, self.low), np.where(after, THRESHOLDS.loose_bound, self.high)
         for box in self.boxes[tried]:
             low[steps, : p.n] = np.maximum(self.low[steps, : p.n], box[0])
             high[steps, : p.n] = np.minimum(self.high[steps, : p.n], box[1])

@@ -11,12 +11,12 @@ import numpy as np
 
 from gapcert import Array, Box, Ellipsoid, Goal, Polytope, Region
 from gapcert.plugin import Bools, Ints
+from gapcert_mpc.thresholds import THRESHOLDS
 
 from .linearise import Frame
-from .program import LOOSE, Program, Rows
+from .program import Program, Rows
 
 TURN = 2 * np.pi
-OUT = 1e-9  # obstacles are closed: touching one is inside
 
 
 @final
@@ -135,7 +135,7 @@ def scene(goal: Goal, frame: Frame, rows: Rows, F: Array) -> tuple[Rows, Scene]:
     cuts = [p.cuts for p in (*targets, *obstacles)]
     C = np.concatenate([c for c in cuts if len(c)] or [np.zeros((0, nx))])
     first = nz + len(rows.C)
-    free = np.full(len(C), LOOSE)
+    free = np.full(len(C), THRESHOLDS.loose_bound)
     C = np.hstack([C, np.zeros((len(C), nz - nx))])
     more = Rows(np.concatenate([rows.C, C]), np.concatenate([rows.low, -free]), np.concatenate([rows.high, free]))
     low, high = (np.full((len(targets), first + len(C)), s * np.inf) for s in (-1, 1))
@@ -146,12 +146,12 @@ def scene(goal: Goal, frame: Frame, rows: Rows, F: Array) -> tuple[Rows, Scene]:
         at += len(p.cuts)
     faces: list[tuple[int, int, int, float]] = []
     for o, p in enumerate(obstacles):
-        found = [(o, j, -1, float(p.low[j]) - OUT) for j in range(nx) if p.low[j] > -1]
-        found += [(o, j, 1, float(p.high[j]) + OUT) for j in range(nx) if p.high[j] < 1]
-        found += [(o, at + i, 1, float(b) + OUT) for i, b in enumerate(p.bounds)]
+        found = [(o, j, -1, float(p.low[j]) - THRESHOLDS.outside_margin) for j in range(nx) if p.low[j] > -1]
+        found += [(o, j, 1, float(p.high[j]) + THRESHOLDS.outside_margin) for j in range(nx) if p.high[j] < 1]
+        found += [(o, at + i, 1, float(b) + THRESHOLDS.outside_margin) for i, b in enumerate(p.bounds)]
         at += len(p.cuts)
         # Nothing is beyond an obstacle that covers all.
-        faces += found or [(o, 0, 1, LOOSE)]
+        faces += found or [(o, 0, 1, THRESHOLDS.loose_bound)]
     obstacle, row, side = np.array([f[:3] for f in faces], dtype=np.int64).reshape(-1, 3).T
     return more, Scene(low, high, obstacle, row, side, np.array([f[3] for f in faces], dtype=np.float64), F)
 

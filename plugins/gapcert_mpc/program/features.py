@@ -10,11 +10,10 @@ import scipy.linalg
 
 from gapcert import Array, Domain, Interval
 from gapcert.plugin import majorant_of
+from gapcert_mpc.thresholds import THRESHOLDS
 
 from .linearise import Frame, Nominal, Stages, in_frame, tiles
 from .tube import Section, searched
-
-NEAR = 0.1  # plans are mostly so near, in half-ranges, to where majorants are centred
 
 
 def featured(nominal: Nominal, zone: Domain, horizon: int, frame: Frame, constant: bool) -> tuple[Stages, Array]:
@@ -58,18 +57,19 @@ def _bounded(error: Callable[[Interval], Interval], zone: Domain, centre: Array,
 
     if constant or not np.isfinite(top - bottom).all():
         return shift, (ends - shift).mag.max(axis=0), np.zeros((ends.shape[1], len(centre)))
-    mean = NEAR * (zone.high - zone.low) / 4
+    mean = THRESHOLDS.majorant_near * (zone.high - zone.low) / 4
     return shift, *majorant_of(bound, zone.low, zone.high, centre, mean=mean)
 
 
 def grown(closed: Array, rows: Array, c: Array, G: Array, whole: Array, steps: int) -> Array:
-    """(r,): the exact half-widths along rows (r, n) after so many steps; w_k = c + G(NEAR + e_k), e_k those along `whole`."""
+    """(r,): the exact half-widths along rows (r, n) after so many steps; w_k = c + G(`majorant_near` + e_k), e_k those along
+    `whole`."""
     terms = [np.vstack([rows, whole])]
     for _ in range(steps - 1):
         terms.append(terms[-1] @ closed)
     size, w, e = np.abs(np.array(terms)), np.empty((steps, len(c))), np.zeros(len(whole))
     for k in range(steps):
-        w[k] = c + G @ (NEAR + e)
+        w[k] = c + G @ (THRESHOLDS.majorant_near + e)
         total = np.einsum("krn,kn->r", size[: k + 1], w[k::-1])
         e = total[len(rows) :]
     return np.asarray(total[: len(rows)])
@@ -100,7 +100,7 @@ def passing(stages: Stages, F: Array, rows: Array) -> Section:
         return kept(Section.of(A, B, gain(logs)), c, G, F, rows, steps)
 
     def flat(logs: Array) -> Array:
-        return kept(Section.of(A, B, gain(logs)), c + G.sum(axis=1) * NEAR, 0 * G, F, rows, steps)
+        return kept(Section.of(A, B, gain(logs)), c + G.sum(axis=1) * THRESHOLDS.majorant_near, 0 * G, F, rows, steps)
 
     def shares(of: Callable[[Array], Array]) -> Callable[[Array], Array]:
         def tried(logs: Array) -> Array:
@@ -119,11 +119,11 @@ def passing(stages: Stages, F: Array, rows: Array) -> Section:
 
 def kept(section: Section, c: Array, G: Array, F: Array, rows: Array, steps: int) -> Array:
     """(r,): what the tube of a section takes of the rows (r, n + m), each scaled to 1, after so many steps; it is that of a
-    plan whose features are at NEAR.
+    plan whose features are at `majorant_near`.
     """
     size = np.abs(section.H)
     moved = np.abs(section.moved) + size @ G @ np.abs(F @ section.feedback)
-    s, w = np.zeros(len(size)), size @ (c + G.sum(axis=1) * NEAR)
+    s, w = np.zeros(len(size)), size @ (c + G.sum(axis=1) * THRESHOLDS.majorant_near)
     for _ in range(steps):
         s = moved @ s + w
     return np.asarray(np.abs(rows @ section.feedback) @ s)

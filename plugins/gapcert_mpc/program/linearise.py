@@ -12,9 +12,7 @@ import numpy as np
 import gapcert
 from gapcert import Array, GapFunction, Interval, Model
 from gapcert.plugin import Bools, majorant_of
-
-CELLS = 4096
-PARTS = 4
+from gapcert_mpc.thresholds import THRESHOLDS
 
 
 @final
@@ -148,7 +146,7 @@ class Nominal:
             # Imported by name it would be the module of this name to the import contracts.
             c, G = gapcert.plugin.majorant((over - shift).mag, cells.lo, cells.hi, centre)
         elif not constant and np.isfinite(c).all():
-            c, G = majorant_of(lambda cells: (wrong(cells) - shift).mag, low, high, centre, CELLS // 4)
+            c, G = majorant_of(lambda cells: (wrong(cells) - shift).mag, low, high, centre, THRESHOLDS.slope_cells // 4)
         units = slope, self(centre[None])[0] + shift, c, G
         one = in_frame(frame, *(a[None] for a in units), *(frame.into(a)[None] for a in (centre, low, high)))
         return one.repeated(horizon + 1)
@@ -180,10 +178,10 @@ class Nominal:
         # Rounding of the frame is far below 1e-12 of a range.
         at, spare = frame.out(z), 1e-12 * frame.half
         below, above = at - (frame.out(low) - spare), frame.out(high) + spare - at
-        share = (np.arange(PARTS) + 1)[:, None, None] / PARTS
+        share = (np.arange(THRESHOLDS.slope_parts) + 1)[:, None, None] / THRESHOLDS.slope_parts
         boxes = Interval((at - share * below).reshape(-1, z.shape[1]), (at + share * above).reshape(-1, z.shape[1]))
-        slopes = self.slopes(boxes).reshape(PARTS, len(z), self.nx, -1)
-        mean = sum((slopes[m] for m in range(1, PARTS)), slopes[0]) / PARTS
+        slopes = self.slopes(boxes).reshape(THRESHOLDS.slope_parts, len(z), self.nx, -1)
+        mean = sum((slopes[m] for m in range(1, THRESHOLDS.slope_parts)), slopes[0]) / THRESHOLDS.slope_parts
         left = self.left(Interval(at - below, at + above))
         value, error = self._at(at)
         return in_frame(frame, mean.mid, value + left.mid, left.rad + error, mean.rad, z, low, high)
@@ -220,7 +218,7 @@ def in_frame(frame: Frame, slope: Array, value: Array, c: Array, G: Array, zeta:
     return Stages(J[..., :n], J[..., n:], d, c / half, G * frame.half / half[:, None], zeta, low, high)
 
 
-def tiles(low: Array, high: Array, budget: int = CELLS) -> Interval:
+def tiles(low: Array, high: Array, budget: int = THRESHOLDS.slope_cells) -> Interval:
     """At most `budget` boxes that tile [low, high], as many along each axis."""
     count = max(1, int(budget ** (1 / len(low)) + 1e-9))
     edges = [np.linspace(a, b, count + 1) for a, b in zip(low, high, strict=True)]

@@ -9,14 +9,11 @@ import scipy.sparse as sp
 import scipy.sparse.linalg
 
 from gapcert import Array
+from gapcert_mpc.thresholds import THRESHOLDS
 
 from .minimal_tube import Least
 from .program import Program
 from .solver import Piqp
-
-DELTA = 1e-7  # of the proximal terms
-ROUNDS = 4
-DUAL = 1e-9  # how far below 0 a multiplier may come out, with costs near 1
 
 
 @final
@@ -77,16 +74,18 @@ class Pieces:
         A, wanted = sp.csr_matrix(p.A)[on], np.where((active[on] > 0)[:, None], high[on], low[on])
         P = p.P + sp.triu(p.P, 1).T
         own, rows = sp.identity(p.size), sp.identity(len(on))
-        factors = scipy.sparse.linalg.splu(sp.bmat([[P + DELTA * own, A.T], [A, -DELTA * rows]], format="csc"))
+        factors = scipy.sparse.linalg.splu(
+            sp.bmat([[P + THRESHOLDS.proximal_weight * own, A.T], [A, -THRESHOLDS.proximal_weight * rows]], format="csc")
+        )
         z, y = np.hstack([centre[:, None], np.zeros((p.size, p.n))]), np.zeros((len(on), p.n + 1))
         q = np.hstack([p.q[:, None], np.zeros((p.size, p.n))])
-        for _ in range(ROUNDS):
-            found = factors.solve(np.vstack([DELTA * z - q, wanted - DELTA * y]))
+        for _ in range(THRESHOLDS.proximal_rounds):
+            found = factors.solve(np.vstack([THRESHOLDS.proximal_weight * z - q, wanted - THRESHOLDS.proximal_weight * y]))
             z, y = found[: p.size], found[p.size :]
         dual, unit, value = np.zeros((len(p.low), p.n + 1)), np.eye(1, p.n + 1), p.A @ z
         dual[on] = y
         side = np.flatnonzero(~equal[on])
-        signs = -np.sign(active[on[side]])[:, None] * y[side] - DUAL * unit
+        signs = -np.sign(active[on[side]])[:, None] * y[side] - THRESHOLDS.multiplier_error * unit
         # Rows of the trajectory alone tell at once; those of its tube may still hold with a smaller one.
         alone = np.diff(sp.csr_matrix(p.A[:, p.at["size"][0] :]).indptr) == 0
         missed = [sign * (value - bound) - p.tolerance / 2 * unit for sign, bound in ((1, high), (-1, low))]

@@ -12,13 +12,12 @@ import scipy.sparse as sp
 
 from gapcert import Array
 from gapcert.plugin import Ints
+from gapcert_mpc.thresholds import THRESHOLDS
 
 from .constraints import Preferred
 from .linearise import Stages
 from .solver import Piqp
 from .tube import Section
-
-LOOSE = 1e3  # half-ranges: a bound that asks nothing, and a finite one leaves the row of its kind
 
 
 @final
@@ -247,11 +246,11 @@ class Program:
     def bound(self, low: Array, high: Array) -> None:
         """New bounds low, high (N+1, n+m+r) of what `whole` reads, at each stage that has rows; those of `final` stay."""
         up, down = self.upper >= 0, self.lower >= 0
-        self.high[self.upper[up]] = np.minimum(high, LOOSE)[up] - self.off[up]
+        self.high[self.upper[up]] = np.minimum(high, THRESHOLDS.loose_bound)[up] - self.off[up]
         if self.variable:
-            self.high[self.lower[down]] = np.minimum(-low, LOOSE)[down] - self.off[down]
+            self.high[self.lower[down]] = np.minimum(-low, THRESHOLDS.loose_bound)[down] - self.off[down]
         else:
-            self.low[self.lower[down]] = np.maximum(low, -LOOSE)[down] + self.off[down]
+            self.low[self.lower[down]] = np.maximum(low, -THRESHOLDS.loose_bound)[down] + self.off[down]
 
     def tube(self, away: Array) -> Array:
         """s (N+1, p) of a plan with a_k = away (≥ N, f)."""
@@ -364,8 +363,8 @@ class Program:
         """low, high (N+1, n+m+r) of the box of each stage, and of the rows."""
         st, shape = self.stages, (self.N + 1, len(self.rows.C))
         return (
-            np.hstack([st.low, np.broadcast_to(np.maximum(self.rows.low, -LOOSE), shape)]),
-            np.hstack([st.high, np.broadcast_to(np.minimum(self.rows.high, LOOSE), shape)]),
+            np.hstack([st.low, np.broadcast_to(np.maximum(self.rows.low, -THRESHOLDS.loose_bound), shape)]),
+            np.hstack([st.high, np.broadcast_to(np.minimum(self.rows.high, THRESHOLDS.loose_bound), shape)]),
         )
 
     def target(self, z: Array, weights: Array) -> Array | None:
@@ -423,7 +422,7 @@ class Program:
         self.high[first : first + self.n] = x
         if self.rates is not None:
             on = np.flatnonzero(np.isfinite(self.rates))
-            middle, room = 0.0 if before is None else before[on], np.full(len(on), LOOSE)
+            middle, room = 0.0 if before is None else before[on], np.full(len(on), THRESHOLDS.loose_bound)
             if before is not None:
                 room = self.rates[on] - self.tolerance - self.section.support[self.n :][on] @ self.s0
             self.low[self.changes], self.high[self.changes] = middle - room, middle + room

@@ -10,8 +10,7 @@ import numpy as np
 import scipy.linalg
 
 from gapcert import Array, UsageError
-
-POLYGONS = (2, 3, 4, 6, 8, 12)
+from gapcert_mpc.thresholds import THRESHOLDS
 
 
 @final
@@ -36,7 +35,7 @@ class Section:
         V, pairs = _modes(closed)
         T = np.asarray(np.linalg.inv(V), dtype=np.float64)
         best: Section | None = None
-        for faces in POLYGONS:
+        for faces in THRESHOLDS.tube_polygons:
             H, P, moved = _polygons(closed, V, T, pairs, faces)
             found = cls(H, P, K, closed, moved)
             if best is None or found.radius < best.radius - 1e-9:

@@ -10,16 +10,11 @@ from typing import NamedTuple, final
 import numpy as np
 
 from gapcert import Array
+from gapcert_mpc.thresholds import THRESHOLDS
 
 from .pieces import Pieces, active
 from .program import Program
 from .solver import Answer, Choice, Name, Osqp, Piqp
-
-RUNS, STEPS, TRIES, STILL = 6, 40, 60, 4
-MOST, LEAST = 12, 0.01  # pieces, and the share of the steps that each must be worth
-RHOS, ALPHAS = (0.1, 0.03, 0.3, 1.0), (1.0, 1.6)
-# One step of an interior-point method factors what one of operator splitting solves with: five times as long, as measured.
-DEARER = 5
 
 
 @final
@@ -52,17 +47,17 @@ def tuned(
     seen = _runs(program, aim, np.random.default_rng(seed))
     counts = Counter(active(program, s.answer.z, s.answer.y).tobytes() for s in seen)
     # A piece is affine in the state alone; where rates are limited, the input before matters, too.
-    most = 0 if program.rates is not None else MOST
-    often = [key for key, count in counts.most_common(most) if count >= LEAST * len(seen)]
+    most = 0 if program.rates is not None else THRESHOLDS.piece_count
+    often = [key for key, count in counts.most_common(most) if count >= THRESHOLDS.piece_share * len(seen)]
     kept = np.array([np.frombuffer(key, dtype=np.int8) for key in often]).reshape(len(often), len(program.low))
     made = Pieces(program, kept, aim)
     rest = [s for s in seen if made(s.x) is None]
-    rest = rest if len(rest) >= STEPS else seen
-    dear = np.array([DEARER * s.answer.iterations for s in rest])
+    rest = rest if len(rest) >= THRESHOLDS.tuning_steps else seen
+    dear = np.array([THRESHOLDS.interior_cost * s.answer.iterations for s in rest])
     best, found = (float(dear.sum()) if asked == "auto" else np.inf), (Tuning.rho, Tuning.alpha)
     name: Name = "piqp" if asked == "auto" else asked
-    for rho in RHOS if asked in ("auto", "osqp") else ():
-        for alpha in ALPHAS:
+    for rho in THRESHOLDS.tried_rhos if asked in ("auto", "osqp") else ():
+        for alpha in THRESHOLDS.tried_alphas:
             tell(f"solver settings ρ {rho:g}, α {alpha:g}", {"least work": best, "with": name})
             work = _work(program, rest, dear, rho, alpha, best)
             if work < best:
@@ -74,12 +69,12 @@ def _runs(program: Program, aim: Array, rng: np.random.Generator) -> list[_Seen]
     st, n, seen, runs = program.stages, program.n, list[_Seen](), 0
     # Which rows hold a plan back shows where it is exact.
     solver = Piqp(program.P, program.q, program.A, program.low, program.high, 1e-11)
-    for number in range(TRIES):
-        if runs == RUNS + STILL:
+    for number in range(THRESHOLDS.tuning_tries):
+        if runs == THRESHOLDS.tuning_runs + THRESHOLDS.tuning_still:
             break
-        x = aim if number < STILL else rng.uniform(st.low[0, :n], st.high[0, :n])
+        x = aim if number < THRESHOLDS.tuning_still else rng.uniform(st.low[0, :n], st.high[0, :n])
         before = None
-        for _ in range(STEPS):
+        for _ in range(THRESHOLDS.tuning_steps):
             program.begin(x)
             solver.update(low=program.low, high=program.high)
             answer = solver.solve()

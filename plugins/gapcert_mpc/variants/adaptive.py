@@ -19,6 +19,7 @@ from gapcert_mpc.planning.plans import Memory
 from gapcert_mpc.program.linearise import Nominal
 from gapcert_mpc.saved_models import known, pair
 from gapcert_mpc.task import Task
+from gapcert_mpc.thresholds import THRESHOLDS
 
 from .membership import Membership
 from .parameters import Family
@@ -26,7 +27,6 @@ from .parameters import Family
 Key = tuple[tuple[int, int, int], ...]
 Maker = Callable[[SynthesisProblem, MpcController | None], MpcController]
 """Of the controller for one box of parameters, in what it need not find again like another."""
-SHARES = 8  # per width of a level, to which its box is rounded outwards
 
 
 @final
@@ -47,13 +47,13 @@ class Held(NamedTuple):
 class Levels:
     """Controllers for boxes of parameters, made when they are asked for: the first is for the whole range Θ₀.
 
-    At level ℓ of a parameter the box is between a width of 2^−ℓ of the range and 1 + 2 / SHARES times as much, on a lattice, so
-    that runs which have learned the same share a controller, and nothing depends on the order of what was asked.
+    At level ℓ of a parameter the box is between a width of 2^−ℓ of the range and 1 + 2 / `box_shares` times as much, on a
+    lattice, so that runs which have learned the same share a controller, and nothing depends on the order of what was asked.
     """
 
     def __init__(self, family: Family, options: Mapping[str, Any], depth: int, make: Maker) -> None:
         self.family, self.options, self.depth, self.make = family, options, depth, make
-        self.first: Key = ((0, 0, SHARES),) * len(family.parameters)
+        self.first: Key = ((0, 0, THRESHOLDS.box_shares),) * len(family.parameters)
         self.made: dict[Key, MpcController] = {}
 
     def __getitem__(self, key: Key) -> MpcController:
@@ -71,9 +71,9 @@ class Levels:
     def box(self, key: Key) -> Interval:
         """Θ of a level, (nθ,)."""
         whole = self.family.range
-        pitch = (whole.hi - whole.lo) / SHARES / 2.0 ** np.array([level for level, _, _ in key])
+        pitch = (whole.hi - whole.lo) / THRESHOLDS.box_shares / 2.0 ** np.array([level for level, _, _ in key])
         low, high = (whole.lo + pitch * np.array([part[k] for part in key]) for k in (1, 2))
-        at_end = np.array([b == SHARES << level for level, _, b in key])
+        at_end = np.array([b == THRESHOLDS.box_shares << level for level, _, b in key])
         return Interval(low, np.where(at_end, whole.hi, np.minimum(high, whole.hi)))
 
     def key(self, theta: Interval, now: Key) -> Key:
@@ -84,11 +84,11 @@ class Levels:
         if all(level <= old for level, (old, _, _) in zip(levels, now, strict=True)):
             return now
         for j, level in enumerate(np.maximum(levels, [old for old, _, _ in now]).tolist()):
-            pitch = (whole.hi[j] - whole.lo[j]) / SHARES / 2.0**level
+            pitch = (whole.hi[j] - whole.lo[j]) / THRESHOLDS.box_shares / 2.0**level
             first, last = np.floor((theta.lo[j] - whole.lo[j]) / pitch), np.ceil((theta.hi[j] - whole.lo[j]) / pitch)
             # Outwards, whatever was rounded.
             first, last = first - (whole.lo[j] + pitch * first > theta.lo[j]), last + (whole.lo[j] + pitch * last < theta.hi[j])
-            out.append((level, max(int(first), 0), min(int(last), SHARES << level)))
+            out.append((level, max(int(first), 0), min(int(last), THRESHOLDS.box_shares << level)))
         return tuple(out)
 
 

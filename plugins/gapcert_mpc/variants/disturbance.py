@@ -20,14 +20,11 @@ from gapcert_mpc.controller import MpcController, PlanController, loaded
 from gapcert_mpc.planning.design import Design
 from gapcert_mpc.planning.plans import Memory
 from gapcert_mpc.task import Task
+from gapcert_mpc.thresholds import THRESHOLDS
 
 from .regulation import regulating
 from .sls import SlsSolver
 from .sls_problem import LtvProblem, SlsPlan
-
-ROUNDING = 1e-9  # in half-ranges: what disturbances may seem larger by, since they are computed from states
-INSIDE = 1e-7  # by so much the rows of the terminal set are stricter than those of stages, which are solved a little inside
-BYTES = 1 << 29  # of plans that are remembered
 
 
 @final
@@ -61,12 +58,12 @@ class Responses:
         flat = design.stages.only(np.zeros(len(design.frame.half), dtype=np.bool_))
         self.stage, self.N, self.section = flat, flat.horizon, design.section
         self.n, self.m = flat.B.shape[1:]
-        self.A, self.B, self.d, self.radius = flat.A[0], flat.B[0], flat.d[0], flat.c[0] + ROUNDING
+        self.A, self.B, self.d, self.radius = flat.A[0], flat.B[0], flat.d[0], flat.c[0] + THRESHOLDS.computed_disturbance
         self.base, self.more, _ = replace(design, stages=flat).program().terminal
         moved = np.hstack([np.eye(self.n) - self.A, -self.B])
         self.steady = design.reference + np.linalg.pinv(moved) @ (self.d - moved @ design.reference)
         self.turn = scipy.linalg.null_space(moved)
-        if np.abs(moved @ self.steady - self.d).max() + ROUNDING > design.tolerance:
+        if np.abs(moved @ self.steady - self.d).max() + THRESHOLDS.computed_disturbance > design.tolerance:
             raise UsageError(
                 f"controller.tolerance: {design.tolerance} is finer than steady pairs are known; choose a larger one"
             )
@@ -148,7 +145,7 @@ class Responses:
         H, p, q = sec.H, len(base), self.turn.shape[1]
         at, move = H @ self.steady[:n], H @ self.turn[:n]
         grows = np.abs(whole @ np.vstack([sec.P, sec.K @ sec.P]))
-        room, step, none = grows @ base + INSIDE, whole @ self.turn, np.zeros((len(whole), n))
+        room, step, none = grows @ base + THRESHOLDS.terminal_inside, whole @ self.turn, np.zeros((len(whole), n))
         ends = [[H, -move, -more], [-H, move, -more]]
         held = [[none, step, grows @ more], [none, -step, grows @ more]]
         C = np.block([*ends, *held, [np.zeros((p, n)), np.zeros((p, q)), -np.eye(p)]])
@@ -182,7 +179,7 @@ class DisturbanceMpcController(PlanController[Run]):
     def memory(self) -> Memory[Run]:  # type: ignore[override]
         p = self.responses.solver.problem
         N, n, m = p.B.shape
-        return Memory(max(1024, BYTES // (8 * (N + 1) * (n + m) * (1 + N * n))))
+        return Memory(max(1024, THRESHOLDS.plan_bytes // (8 * (N + 1) * (n + m) * (1 + N * n))))
 
     @property
     def resolution(self) -> int:
@@ -222,7 +219,7 @@ class DisturbanceMpcController(PlanController[Run]):
 
     def _held(self, x: Array, held: Run) -> bool:
         """Is the run at x, and was every disturbance since its plan within its bounds?"""
-        return bool(held.sound and np.abs(x - held.x).max() <= ROUNDING)
+        return bool(held.sound and np.abs(x - held.x).max() <= THRESHOLDS.computed_disturbance)
 
     def _stepped(self, u: Array, after: Array, held: Run) -> bool:
         """Was the step's disturbance within its bounds?"""

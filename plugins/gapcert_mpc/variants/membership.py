@@ -9,10 +9,10 @@ import numpy as np
 
 from gapcert import Array, Interval
 from gapcert.plugin import Bools
+from gapcert_mpc.thresholds import THRESHOLDS
 
 from .parameters import Family, tiled
 
-MOST = 32  # boxes into which Θ is cut
 TURN = Interval(np.nextafter(2 * np.pi, 0.0), np.nextafter(2 * np.pi, 7.0))
 
 
@@ -83,7 +83,7 @@ class Membership:
 
     def _narrowed(self, z: Interval, goal: Interval, theta: Interval) -> tuple[Interval, Bools]:
         n, q = theta.shape
-        parts = list(tiled(theta, max(1, int(MOST ** (1 / q) + 1e-9))))
+        parts = list(tiled(theta, max(1, int(THRESHOLDS.membership_boxes ** (1 / q) + 1e-9))))
         # Parts one after the other, in each of them all rows.
         again = np.tile(np.arange(n), len(parts))
         boxes = Interval(np.concatenate([a for a, _ in parts]), np.concatenate([b for _, b in parts]))

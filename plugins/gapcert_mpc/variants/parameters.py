@@ -13,9 +13,7 @@ import numpy as np
 
 from gapcert import Array, GapFunction, Interval, Model, Parameter, SynthesisProblem, UsageError, registry
 from gapcert.plugin import magnitude
-
-MANY, KEPT = 200, 4  # boxes at once, of which so many sets are kept
-PIECES = 4  # on either side of θ̂, along which slopes are bounded one by one
+from gapcert_mpc.thresholds import THRESHOLDS
 
 
 @final
@@ -83,17 +81,20 @@ class Family:
         """
         n, total = len(boxes), Interval.exact(np.zeros((len(boxes), self.model.nx)))
         for j in range(len(centre)):
-            ways = [np.linspace(centre[j], end, PIECES + 1) for end in (theta.lo[j], theta.hi[j])]
-            first, last = (np.concatenate([way[k : PIECES + k] for way in ways]) for k in (0, 1))
-            low, high = np.tile(centre, (2 * PIECES, 1)), np.tile(centre, (2 * PIECES, 1))
+            ways = [np.linspace(centre[j], end, THRESHOLDS.slope_pieces + 1) for end in (theta.lo[j], theta.hi[j])]
+            first, last = (np.concatenate([way[k : THRESHOLDS.slope_pieces + k] for way in ways]) for k in (0, 1))
+            low, high = np.tile(centre, (2 * THRESHOLDS.slope_pieces, 1)), np.tile(centre, (2 * THRESHOLDS.slope_pieces, 1))
             low[:, :j], high[:, :j] = theta.lo[:j], theta.hi[:j]
             low[:, j], high[:, j] = np.minimum(first, last), np.maximum(first, last)
-            again = boxes[np.tile(np.arange(n), 2 * PIECES)]
+            again = boxes[np.tile(np.arange(n), 2 * THRESHOLDS.slope_pieces)]
             slopes = self.slopes(again, Interval(np.repeat(low, n, axis=0), np.repeat(high, n, axis=0)))[:, :, j]
-            moves = slopes * (Interval.exact(last) - Interval.exact(first))[np.repeat(np.arange(2 * PIECES), n)][:, None]
+            moves = (
+                slopes
+                * (Interval.exact(last) - Interval.exact(first))[np.repeat(np.arange(2 * THRESHOLDS.slope_pieces), n)][:, None]
+            )
             reached = so_far = Interval.exact(np.zeros(total.shape))
-            for k in range(2 * PIECES):
-                so_far = moves[n * k : n * (k + 1)] + (so_far if k % PIECES else 0.0)
+            for k in range(2 * THRESHOLDS.slope_pieces):
+                so_far = moves[n * k : n * (k + 1)] + (so_far if k % THRESHOLDS.slope_pieces else 0.0)
                 reached = Interval.hull(reached, so_far)
             total = total + reached
         return total
@@ -102,11 +103,11 @@ class Family:
         """What is left of the gap beside its predictor over each box; it is kept of the many cells that all boxes Θ share."""
         gap = self.problem.gap
         assert gap is not None, "who asks has a gap"
-        if len(boxes) < MANY:
+        if len(boxes) < THRESHOLDS.many_boxes:
             return gap.remainder_ends_over(boxes)
         key = hashlib.sha256(boxes.lo.tobytes() + boxes.hi.tobytes()).digest()
         if key not in self.seen:
-            if len(self.seen) >= KEPT:
+            if len(self.seen) >= THRESHOLDS.kept_sets:
                 self.seen.pop(next(iter(self.seen)))
             self.seen[key] = gap.remainder_ends_over(boxes)
         return self.seen[key]

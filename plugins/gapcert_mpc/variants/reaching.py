@@ -16,8 +16,7 @@ from gapcert_mpc.program.corridors import scene
 from gapcert_mpc.program.features import featured, passing
 from gapcert_mpc.program.solver import Name
 from gapcert_mpc.task import Task
-
-STARTS = 64
+from gapcert_mpc.thresholds import THRESHOLDS
 
 
 def reaching(task: Task) -> MpcController:
@@ -43,7 +42,7 @@ def reaching(task: Task) -> MpcController:
     if not len(pool.arrival):
         return task.nothing(f"from none of {searches} starts a plan of {horizon} steps reaches the target with its whole tube")
     made = MpcController(goal, replace(design, pool=pool), {}, solver)
-    fraction = float(looked(made, task.drawn(rng, min(options.starts, STARTS)), problem.emit).mean())
+    fraction = float(looked(made, task.drawn(rng, min(options.starts, THRESHOLDS.starts)), problem.emit).mean())
     tube = half_widths(design)
     evidence = {
         "horizon": horizon,

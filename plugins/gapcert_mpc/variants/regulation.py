@@ -19,9 +19,8 @@ from gapcert_mpc.program.program import NotShrinking
 from gapcert_mpc.program.solver import Name
 from gapcert_mpc.program.tube import Section, taken, tightest
 from gapcert_mpc.program.tuning import Tuning, tuned
-from gapcert_mpc.task import REST, Task
-
-SMALL = 0.05  # of each range: a tube that takes less is not worth the variables that follow γ
+from gapcert_mpc.task import Task
+from gapcert_mpc.thresholds import THRESHOLDS
 
 
 def regulating(task: Task, like: MpcController | None = None) -> MpcController:
@@ -40,7 +39,7 @@ def regulating(task: Task, like: MpcController | None = None) -> MpcController:
     if options.linearisation == "once":
         task.tell("gain and section of the tube")
         section, shares = _section(stages, whole, like, rates)
-        if like is None and options.majorant == "auto" and not (shares < SMALL).all():
+        if like is None and options.majorant == "auto" and not (shares < THRESHOLDS.small_tube).all():
             stages = nominal.straight(box.low, box.high, options.horizon, frame)
             section, shares = _section(stages, whole, like, rates)
     if not (shares < 1).all():
@@ -84,7 +83,7 @@ def _design(task: Task, stages: Stages, section: Section, rates: Array | None) -
     options, domain, frame = task.options, task.problem.domain, task.frame
     moments = tracking.moments(options.reference, task.problem.model.period)
     weights, successive, nowhere = task.weights(stages), options.linearisation == "successive", np.zeros(len(frame.half))
-    soft = preferred(options.soft, domain, frame, weights.T[0, 0] / REST)
+    soft = preferred(options.soft, domain, frame, weights.T[0, 0] / THRESHOLDS.rest_weight)
     design = Design(frame, stages, section, task.rows, weights, nowhere, options.tolerance, successive, rates=rates)
     try:
         program = design.program()

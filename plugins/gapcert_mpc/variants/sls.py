@@ -14,15 +14,12 @@ import numpy.typing as npt
 
 from gapcert import Array, UsageError
 from gapcert.plugin import Ints
+from gapcert_mpc.thresholds import THRESHOLDS
 
 from . import sls_kernels as kernels
 from .sls_problem import LtvProblem, SlsPlan, SlsRefusal
 from .sls_trajectories import Condensed, limits_of, verified
 
-_TOLERANCE = 1e-9
-_INSIDE = 1e-8  # rows are solved for limits that lie this part further inside, since they then hold exactly
-_HOPELESS = 1e8  # times the cost without rows: a plan that costs more counts as none
-_ROUNDS = 40
 _DYNAMICS = {"A", "B", "Q", "R", "Q_end", "Cx", "Cu", "Cp", "C_end"}
 
 
@@ -70,7 +67,7 @@ class SlsSolver:
         columns = np.flatnonzero(radii)
         v, V, count = np.zeros(N * m), np.zeros((len(columns), N * m)), 0
         status, working, bound, multipliers = kernels.SOLVED, self.working, rows.cost, np.zeros(self.working.shape)
-        for _ in range(_ROUNDS):
+        for _ in range(THRESHOLDS.sls_rounds):
             if working.any():
                 status, v, V, multipliers, steps, extra = self._restricted(rows, working)
                 count, bound = count + steps, max(bound, rows.cost + extra)
@@ -107,7 +104,7 @@ class SlsSolver:
         staged = p.Cx @ x[:N, :, None] + p.Cu @ u[:, :, None] + p.Cp @ before[:, :, None]
         radii = p.r.ravel()
         columns, limits = np.flatnonzero(radii), limits_of(p)
-        limits -= _INSIDE * (1.0 + np.where(np.isinf(limits), 0.0, np.abs(limits)))
+        limits -= THRESHOLDS.sls_inside * (1.0 + np.where(np.isinf(limits), 0.0, np.abs(limits)))
         # A response without rows costs r² Pᵢᵢ.
         least = 0.5 * p.response_weight * float(radii**2 @ np.diagonal(self._condensed.P[1:], axis1=1, axis2=2).ravel())
         return _Rows(
@@ -149,7 +146,7 @@ class SlsSolver:
             grams[0],
             (beta, gram, first, stages),
             (row, sign, limit),
-            (rows.cost, _TOLERANCE, _HOPELESS * max(rows.cost, 1e-300)),
+            (rows.cost, THRESHOLDS.sls_tolerance, THRESHOLDS.sls_hopeless * max(rows.cost, 1e-300)),
         )
         eta = np.bincount(row, weights=sign * lam, minlength=len(chosen))
         V = np.zeros((len(moving), N * m))

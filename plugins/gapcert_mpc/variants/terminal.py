@@ -24,9 +24,7 @@ from gapcert_mpc.program.features import featured, passing
 from gapcert_mpc.program.linearise import Frame, Stages
 from gapcert_mpc.program.program import Weights
 from gapcert_mpc.task import Task
-
-SMALL = 0.05  # of each range: a tube that takes less is not worth the variables that follow γ
-EDGE = 1e-9  # of half-ranges: a cell does not contain its upper edges, and coordinates are rounded
+from gapcert_mpc.thresholds import THRESHOLDS
 
 
 def _refused(path: str) -> Model:
@@ -100,7 +98,10 @@ def ends(then: GridController, frame: Frame, room: Array, wanted: Array, most: i
     middle, half = frame.x
     pitch = then.widths / half[list(then.on)]
     found = inscribed(then.winning, np.ceil(room[list(then.on)] / pitch).astype(np.int64), most)
-    boxes = [(states(then, b.first, b.after) - middle) / half + np.array([[EDGE], [-EDGE]]) for b in found]
+    boxes = [
+        (states(then, b.first, b.after) - middle) / half + np.array([[THRESHOLDS.cell_edge], [-THRESHOLDS.cell_edge]])
+        for b in found
+    ]
     away = [(float(np.abs(np.clip(wanted, *b) - wanted).max()), -float(np.prod(b[1] - b[0]))) for b in boxes]
     kept = [boxes[k] for k in sorted(range(len(boxes)), key=lambda k: away[k]) if (boxes[k][1] - boxes[k][0] > room).all()]
     return np.array(kept).reshape(-1, 2, len(wanted))
@@ -263,7 +264,7 @@ def handed(task: Task) -> Controller:
         return task.nothing(reason)
     weights, reference = task.weights(stages), steady(task.nominal, frame, *task.wanted())[0]
     made, half = _planning(task, stages, F, weights, reference)
-    if options.majorant == "auto" and not (half < SMALL).all():
+    if options.majorant == "auto" and not (half < THRESHOLDS.small_tube).all():
         made, half = _planning(task, *featured(task.nominal, task.zone, horizon, frame, False), weights, reference)
     assert made.ends is not None
     boxes = ends(then, frame, 2 * (half[:nx] + tolerance), reference[:nx], terminal.boxes)

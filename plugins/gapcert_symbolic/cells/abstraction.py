@@ -13,6 +13,7 @@ from gapcert import Array, Interval, UsageError
 from gapcert.plugin import Bools, Ints
 from gapcert_cells import Along, Successors
 from gapcert_symbolic.kernels.kernels import Bits, Game, Packed, _strides
+from gapcert_symbolic.thresholds import THRESHOLDS
 
 from .bounds import Bound, Grown
 from .gaps import Disturbance, fitted
@@ -22,7 +23,6 @@ from .structure import Part, structure
 
 EPS = float(np.finfo(np.float64).eps)
 PAIRS = 400_000
-MEMORY, BYTES = 8e9, 8  # in all; per cell, without its inputs
 
 
 @final
@@ -125,10 +125,11 @@ def size_of(x: Interval) -> float:
 
 def check_size(grid: Grid, inputs: int, lists: bool) -> None:
     """UsageError where values, sets of inputs and, for goals with a target, the lists of pairs would not fit into memory."""
-    need = float(grid.size) * (BYTES + (inputs + 7) // 8 + (8 * inputs if lists else 0))
-    if need > MEMORY:
+    need = float(grid.size) * (THRESHOLDS.cell_bytes + (inputs + 7) // 8 + (8 * inputs if lists else 0))
+    if need > THRESHOLDS.memory:
         raise UsageError(
-            f"controller: {grid.size:,} cells × {inputs:,} inputs need {need / 1e9:.1f} GB (limit {MEMORY / 1e9:.0f}); "
+            f"controller: {grid.size:,} cells × {inputs:,} inputs need {need / 1e9:.1f} GB (limit "
+            f"{THRESHOLDS.memory / 1e9:.0f}); "
             f"use fewer of either"
         )
 

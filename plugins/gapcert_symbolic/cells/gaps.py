@@ -11,16 +11,10 @@ import numpy.typing as npt
 
 from gapcert import Array, GapFunction, Interval
 from gapcert.plugin import Ints
+from gapcert_symbolic.thresholds import THRESHOLDS
 
 from .grid import Blocks, Grid, corners, flat, share
 from .structure import Part
-
-GAP_BOXES = 60_000
-ENTRIES = 1 << 27  # of all tables of windows, 8 bytes each
-SHARED = 1e-3  # of a cell: what is not worth a longer table
-HELD = 16  # pieces per state without cells, over which the gap is bounded one by one
-DRAWN = 64  # pairs of points per coordinate, that tell along which ones blocks should be narrow
-FAINT = 1e-3  # of the largest weight: what no pair shows to change may change all the same
 
 
 @final
@@ -55,13 +49,13 @@ def disturbance(
     gap: GapFunction,
     grid: Grid,
     axes: tuple[Array, ...],
-    budget: int = GAP_BOXES,
+    budget: int = THRESHOLDS.gap_boxes,
     tick: Callable[[int, int], None] | None = None,
 ) -> Disturbance:
     """The gap's signed interval over at most `budget` boxes that cover all cells and inputs, and all of the other states.
 
-    One block is enough along axes on which the gap changes by less than SHARED cells. Along others blocks are the narrower the
-    more it changes there, as points tell.
+    One block is enough along axes on which the gap changes by less than `shared_change` cells. Along others blocks are the
+    narrower the more it changes there, as points tell.
     """
     states, nx, nz = grid.states, gap_states(grid), gap_states(grid) + len(axes)
     ends = _ends(grid, axes)
@@ -95,7 +89,7 @@ def _ends(grid: Grid, axes: tuple[Array, ...]) -> list[tuple[Array, Array]]:
     for j in range(gap_states(grid)):
         if j not in cells:
             assert grid.frame is not None
-            pieces = np.linspace(grid.frame[j, 0], grid.frame[j, 1], HELD + 1)
+            pieces = np.linspace(grid.frame[j, 0], grid.frame[j, 1], THRESHOLDS.held_pieces + 1)
             cells[j] = pieces[:-1], pieces[1:]
     return [cells[j] for j in sorted(cells)] + [(a, a) for a in axes]
 
@@ -105,23 +99,27 @@ def _hull(ends: list[tuple[Array, Array]]) -> Interval:
 
 
 def _still(gap: GapFunction, grid: Grid, ends: list[tuple[Array, Array]]) -> npt.NDArray[np.bool_]:
-    """(nz,): coordinates along all of which together the gap changes by at most SHARED cells, as its constants prove."""
+    """(nz,): coordinates along all of which together the gap changes by at most `shared_change` cells, as its constants
+    prove."""
     hull = _hull(ends)
     with np.errstate(invalid="ignore"):
         change = gap.lipschitz(hull)[0, list(grid.states)] * hull.width[0] / grid.widths[:, None]
-    return np.asarray((change <= SHARED / len(ends)).all(axis=0))
+    return np.asarray((change <= THRESHOLDS.shared_change / len(ends)).all(axis=0))
 
 
 def _weights(gap: GapFunction, grid: Grid, ends: list[tuple[Array, Array]]) -> Array:
     """(nz,): how many cells the gap moves by, on average over random pairs of points that differ in one coordinate."""
     hull, nz, rng = _hull(ends), len(ends), np.random.default_rng(0x6A9)
-    a, b = (hull.lo + (hull.hi - hull.lo) * rng.random((DRAWN, nz)) for _ in range(2))
+    a, b = (hull.lo + (hull.hi - hull.lo) * rng.random((THRESHOLDS.gap_pairs, nz)) for _ in range(2))
     moved = np.repeat(a[None], nz + 1, axis=0)
     moved[range(nz), :, range(nz)] = b.T
-    band = np.stack(gap.interval(moved.reshape(-1, nz))).reshape(2, nz + 1, DRAWN, -1)[..., list(grid.states)] / grid.widths
+    band = (
+        np.stack(gap.interval(moved.reshape(-1, nz))).reshape(2, nz + 1, THRESHOLDS.gap_pairs, -1)[..., list(grid.states)]
+        / grid.widths
+    )
     with np.errstate(invalid="ignore"):
         change = np.nan_to_num(np.abs(band[:, :nz] - band[:, nz:]), nan=0.0, posinf=1e3).max(axis=(0, 3)).mean(axis=1)
-    return np.asarray(np.maximum(change, FAINT * change.max()) if change.max() > 0 else np.ones(nz))
+    return np.asarray(np.maximum(change, THRESHOLDS.faint_weight * change.max()) if change.max() > 0 else np.ones(nz))
 
 
 @final
@@ -140,8 +138,9 @@ class Tables:
 def fitted(
     added: Disturbance | None, parts: list[Part], grid: Grid, axes: tuple[Array, ...], cells: int, names: Sequence[str] = ()
 ) -> Tables:
-    """Tables of at most ENTRIES for so many cells, as far as the gap decides: it enters the window of an axis by its supremum
-    over all coordinates that cost at most SHARED cells anywhere, and then over those that cost the least on average.
+    """Tables of at most `window_entries` for so many cells, as far as the gap decides: it enters the window of an axis by its
+    supremum over all coordinates that cost at most `shared_change` cells anywhere, and then over those that cost the least on
+    average.
 
     names: of the axes and the inputs.
     """
@@ -151,14 +150,14 @@ def fitted(
     lengths, sizes = [*grid.counts, *(len(a) for a in axes)], [len(b) for b in blocks]
     ends = np.stack([-added.r.lo, added.r.hi]).reshape(2, *sizes, -1)
     cut = [_Cut(ends[..., s], w, _uses(p), lengths, n, cells) for s, w, p in zip(grid.states, grid.widths, parts, strict=True)]
-    while sum(c.entries for c in cut) > ENTRIES and (open_ := [c for c in cut if c.on - c.own]):
+    while sum(c.entries for c in cut) > THRESHOLDS.window_entries and (open_ := [c for c in cut if c.on - c.own]):
         min(open_, key=lambda c: c.next[0]).drop()
     lo, hi = added.r.lo.copy(), added.r.hi.copy()
     for s, c in zip(grid.states, cut, strict=True):
         lo[..., s], hi[..., s] = (v.reshape(lo.shape[:2]) for v in (-c.least[0], c.least[1]))
     wide = [_widened(p, k, c.on, n) for k, (p, c) in enumerate(zip(parts, cut, strict=True))]
     told: dict[str, Any] = {"blocks": dict(zip(names, sizes, strict=False))}
-    dropped = [(name, c) for name, c in zip(names, cut, strict=False) if c.lost > SHARED]
+    dropped = [(name, c) for name, c in zip(names, cut, strict=False) if c.lost > THRESHOLDS.shared_change]
     if dropped:
         told["suprema"] = {name: {"over": [names[d] for d in sorted(c.dropped)], "cells": c.lost} for name, c in dropped}
     return Tables(wide, replace(added, r=Interval(lo, hi)), told)
@@ -178,7 +177,7 @@ class _Cut:
         self.own = uses[0] | {n + e for e in uses[1]}
         varies = {d for d in range(len(lengths)) if (np.ptp(ends, axis=d + 1) > 0).any()}
         self.on, self.dropped = self.own | varies, set[int]()
-        while self.on - self.own and self.next[1] <= SHARED:
+        while self.on - self.own and self.next[1] <= THRESHOLDS.shared_change:
             self.drop()
 
     @property

@@ -9,12 +9,10 @@ import numpy as np
 
 from gapcert import Array, Box, Domain, GapFunction, Goal, Interval, Model, UsageError
 from gapcert.plugin import Bools, Ints, supremum
+from gapcert_symbolic.thresholds import THRESHOLDS
 
 from .grid import Grid, corners
 
-STEPS = 40
-GROW = 0.1  # of each later step's growth, so that a box that grows ever more slowly is reached
-TOLERANCE, BOXES = 1e-2, 20_000
 CHUNK = 20_000
 
 
@@ -56,7 +54,9 @@ class Left:
         z, domain = self.box(v), self.domain
         low, high = np.maximum(z.lo[0], domain.low), np.minimum(z.hi[0], domain.high)
         x = Box(domain.states.axes, tuple(low[: domain.nx].tolist()), tuple(high[: domain.nx].tolist()))
-        return supremum(self.gap, Domain(x, self.inputs, domain.relations), TOLERANCE, BOXES, self.states)[0]
+        return supremum(
+            self.gap, Domain(x, self.inputs, domain.relations), THRESHOLDS.held_tolerance, THRESHOLDS.held_boxes, self.states
+        )[0]
 
     def broken(self, v: Interval) -> str:
         """What fails for some v in V and some input: a relation that does not involve the cells' states, or the range of v."""
@@ -86,18 +86,18 @@ def invariant(left: Left) -> Box:
     """
     stay = left.goal.stay.interval[:, list(left.states)]
     v = _apart(left.image(Interval.exact(stay.mid)))
-    for k in range(STEPS):
+    for k in range(THRESHOLDS.growths):
         if what := left.broken(v):
             raise UsageError(_inadmissible(left, v, what))
         after = _widened(left.image(v), left.gamma(v))
         if v.contains(after).all():
             return _box(left, _widest(left, v) if left.gap is None else v)
         grown = Interval.hull(v, after)
-        more = (GROW if k > 2 else 0.0) * np.maximum(grown.hi - v.hi, v.lo - grown.lo) + 1e-9 * grown.mag
+        more = (THRESHOLDS.growth_ahead if k > 2 else 0.0) * np.maximum(grown.hi - v.hi, v.lo - grown.lo) + 1e-9 * grown.mag
         v = _widened(grown, more[0])
     names = ", ".join(left.goal.stay.names[j] for j in left.states)
     raise UsageError(
-        f"controller.on: no box holds {names} after {STEPS} steps of growing; grid them too, or narrow input_range"
+        f"controller.on: no box holds {names} after {THRESHOLDS.growths} steps of growing; grid them too, or narrow input_range"
     )
 
 
@@ -152,7 +152,7 @@ def _inadmissible(left: Left, v: Interval, what: str) -> str:
 def _admissible(left: Left, gamma: Array) -> bool:
     """Is there an invariant box within the relations, were the gap as large as `gamma` everywhere?"""
     v = left.image(Interval.exact(left.goal.stay.interval[:, list(left.states)].mid))
-    for _ in range(STEPS):
+    for _ in range(THRESHOLDS.growths):
         after = _widened(left.image(v), gamma)
         if left.broken(after):
             return False

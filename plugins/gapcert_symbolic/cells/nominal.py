@@ -10,13 +10,12 @@ import numpy as np
 
 from gapcert import Array, Interval
 from gapcert.plugin import Ints
+from gapcert_symbolic.thresholds import THRESHOLDS
 
 from .bounds import Bound
 from .grid import Blocks, Grid, View, corners, flat
 
 ROWS = 20_000
-FEW = 4096  # pairs that cost less to bound one by one than to put into groups
-SHARED = 1e-3
 
 
 @final
@@ -55,7 +54,11 @@ class Nominal:
         cls, bound: Bound, grid: Grid | View, axes: tuple[Array, ...], asked: tuple[int, ...] | None = None
     ) -> Nominal:
         """As few groups as lose at most a thousandth of a cell anywhere; none where there are few pairs."""
-        size = 1 if bound.groups and grid.size * math.prod(len(a) for a in axes) > FEW else max(len(a) for a in axes)
+        size = (
+            1
+            if bound.groups and grid.size * math.prod(len(a) for a in axes) > THRESHOLDS.single_pairs
+            else max(len(a) for a in axes)
+        )
         while not (found := cls.of_groups(bound, grid, axes, size, asked)).tight():
             size *= 2
         return found
@@ -67,7 +70,7 @@ class Nominal:
 
     def tight(self) -> bool:
         step = max(1, ROWS // len(self.middle))
-        return self.direct or all(self._loss(k, k + step) <= SHARED for k in range(0, self.grid.size, step))
+        return self.direct or all(self._loss(k, k + step) <= THRESHOLDS.shared_change for k in range(0, self.grid.size, step))
 
     def _loss(self, start: int, stop: int) -> float:
         # Two Jacobians in the interval differ by at most its width; the farthest input is half a group away.

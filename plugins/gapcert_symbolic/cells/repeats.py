@@ -13,11 +13,11 @@ import numpy as np
 
 from gapcert.plugin import Bools, Ints
 from gapcert_symbolic.kernels.kernels import _next, _strides, _window, compiled
+from gapcert_symbolic.thresholds import THRESHOLDS
 
 from .abstraction import Windows
 
 SHAPES = 1 << 18  # cells in all shapes of windows together
-SHARE = 4  # cells per class from which on classes pay
 
 
 class Inverse(NamedTuple):
@@ -169,7 +169,7 @@ def inverse(windows: Windows, whole: Any) -> Inverse | None:
     used = {d for axis in windows.axes for d in axis.on} | {k for k, axis in enumerate(windows.axes) if not axis.moves}
     free = np.array([k not in used and not wraps for k, wraps in enumerate(grid.wraps)])
     classes = math.prod(c for c, own in zip(grid.counts, free, strict=True) if not own)
-    if grid.size < SHARE * classes:
+    if grid.size < THRESHOLDS.class_cells * classes:
         return None
     game, counts, wraps = windows.game, np.array(grid.counts), np.array(grid.wraps)
     some = np.where(free, 1, counts)

@@ -9,12 +9,11 @@ from typing import final
 import numpy as np
 
 from gapcert import Array, Interval, Model, UsageError
+from gapcert_symbolic.thresholds import THRESHOLDS
 
 from .grid import Grid
 
-LEAK = 1e-9  # of a cell: what an axis may shift another by and still not count
 ROUNDING = 64 * float(np.finfo(np.float64).eps)  # of a slope, relative
-PAIRS = 256  # per axis, that show what a model without derivatives depends on
 
 
 @final
@@ -39,8 +38,8 @@ def structure(model: Model, grid: Grid, axes: tuple[Array, ...], rounded: bool =
 
     With J over the hull of all cells and inputs, replacing x_j by another value of the grid changes f_k by |J_kj| w_j at most
     (mean-value theorem), w_j the width of the grid, and moving x_k by d changes f_k by d ± |J_kk − 1| w_k. Where that is below
-    LEAK cells, the sum of it over all such axes is the leak. `rounded`: slopes may be taken in floating point, from models that
-    tell which are constant; all others count. One that says nothing of its derivatives is asked at points.
+    `axis_leak` cells, the sum of it over all such axes is the leak. `rounded`: slopes may be taken in floating point, from
+    models that tell which are constant; all others count. One that says nothing of its derivatives is asked at points.
     """
     z, nx = _hull(grid, axes), len(model.states)
     if rounded and (known := model.constant_slopes()) is not None:
@@ -83,12 +82,12 @@ def _told(slope: Array, widths: Array) -> tuple[Array, Array]:
 def _seen(model: Model, z: Interval) -> tuple[Array, Array]:
     """The largest |Δf_k| (nx, nz) where one coordinate changes, and |Δf_k − Δx_k| (nx,), of pairs of random points of a box."""
     rng, nz, nx = np.random.default_rng(0x57A7), z.shape[1], len(model.states)
-    a, b = (z.lo + z.width * rng.random((PAIRS, nz)) for _ in range(2))
+    a, b = (z.lo + z.width * rng.random((THRESHOLDS.structure_pairs, nz)) for _ in range(2))
     others = [a.copy() for _ in range(nz)]
     for j, other in enumerate(others):
         other[:, j] = b[:, j]
     points = np.concatenate([a, *others])
-    after = model.fast_rollout(points[:, :nx], points[:, None, nx:]).x[:, 1].reshape(nz + 1, PAIRS, nx)
+    after = model.fast_rollout(points[:, :nx], points[:, None, nx:]).x[:, 1].reshape(nz + 1, THRESHOLDS.structure_pairs, nx)
     moved = after[1:] - after[0]
     along = np.abs(np.diagonal(moved[:nx], axis1=0, axis2=2) - (b - a)[:, :nx]).max(axis=0)
     return np.abs(moved).max(axis=1).T, along
@@ -98,7 +97,7 @@ def _parts(grid: Grid, nx: int, change: Array, along: Array) -> list[Part]:
     found = []
     for k, state in enumerate(grid.states):
         still, own = change[state], float(along[state])
-        limit = LEAK * float(grid.widths[k])
+        limit = THRESHOLDS.axis_leak * float(grid.widths[k])
         on = tuple(d for d, j in enumerate(grid.states) if d != k and not still[j] <= limit)
         moves = own <= limit
         if not moves and not still[state] <= limit:

@@ -6,10 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from gapcert_symbolic.cells.grid import Grid
-
-PAIRS = 10_000_000
-"""Pairs of a cell and an input up to which a change is tried."""
-HALVINGS, FACTORS = 8, (2, 4)
+from gapcert_symbolic.thresholds import THRESHOLDS
 
 
 def tried(wins: Callable[[float, int], bool], grid: Grid, inputs: int, gap: bool) -> dict[str, Any]:
@@ -20,9 +17,9 @@ def tried(wins: Callable[[float, int], bool], grid: Grid, inputs: int, gap: bool
     """
     out: dict[str, Any] = {}
     pairs, names = grid.size * inputs, [a.name for a in grid.box.axes]
-    if gap and pairs <= PAIRS and (scale := _scale(wins, 1)) is not None:
+    if gap and pairs <= THRESHOLDS.change_pairs and (scale := _scale(wins, 1)) is not None:
         out["gap_scale"] = scale
-    factors = [f for f in FACTORS if grid.nodes is None and pairs * f ** len(grid.counts) <= PAIRS]
+    factors = [f for f in THRESHOLDS.factors if grid.nodes is None and pairs * f ** len(grid.counts) <= THRESHOLDS.change_pairs]
     cells = {f: {name: n * f for name, n in zip(names, grid.counts, strict=True)} for f in factors}
     if enough := next((f for f in factors if wins(1.0, f)), None):
         out["cells"] = cells[enough]
@@ -36,11 +33,11 @@ def _scale(wins: Callable[[float, int], bool], factor: int) -> float | None:
     """The largest of the multiples of 1/256 below 1 with which something wins, by bisection; None if nothing does."""
     if not wins(0.0, factor):
         return None
-    low, high = 0, 2**HALVINGS
+    low, high = 0, 2**THRESHOLDS.change_halvings
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (middle, high) if wins(middle / 2**HALVINGS, factor) else (low, middle)
-    return float(low / 2**HALVINGS)
+        low, high = (middle, high) if wins(middle / 2**THRESHOLDS.change_halvings, factor) else (low, middle)
+    return float(low / 2**THRESHOLDS.change_halvings)
 
 
 def in_words(change: dict[str, Any]) -> str:

@@ -17,11 +17,12 @@ import numpy as np
 from gapcert import Goal, UsageError
 from gapcert.plugin import Bools, Ints
 from gapcert_cells import Splits, SuccessorsByLevel
-from gapcert_symbolic.cells.abstraction import BYTES, MEMORY, Windows
+from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.kernels import reach, sets
 from gapcert_symbolic.kernels.kernels import Game
 from gapcert_symbolic.solvers.problem import Solution
+from gapcert_symbolic.thresholds import THRESHOLDS
 
 from .automata import Labels
 from .games import inside, touching
@@ -112,11 +113,11 @@ class Tree:
         """The children of nodes of the last level, which nobody has won yet."""
         dims, number = len(self.roots), int(split.sum())
         new = number << dims
-        need = float(new) * (BYTES + 16 + (inputs + 7) // 8 + 8 * inputs)
-        if need > MEMORY:
+        need = float(new) * (THRESHOLDS.cell_bytes + 16 + (inputs + 7) // 8 + 8 * inputs)
+        if need > THRESHOLDS.memory:
             raise UsageError(
                 f"controller.refine: {new:,} cells × {inputs:,} inputs on level {self.level + 1} need {need / 1e9:.1f} GB "
-                f"(limit {MEMORY / 1e9:.0f}); use a smaller number"
+                f"(limit {THRESHOLDS.memory / 1e9:.0f}); use a smaller number"
             )
         at = len(self.first)
         self.first[self.start :][split] = at + (np.arange(number) << dims)

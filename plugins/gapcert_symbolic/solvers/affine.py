@@ -18,8 +18,9 @@ from gapcert_symbolic.cells.abstraction import EPS, kept
 from gapcert_symbolic.cells.bounds import Bound, Grown
 from gapcert_symbolic.cells.gaps import Disturbance
 from gapcert_symbolic.cells.grid import Grid, corners
-from gapcert_symbolic.cells.structure import LEAK, ROUNDING
+from gapcert_symbolic.cells.structure import ROUNDING
 from gapcert_symbolic.kernels.kernels import _on, compiled, inlined
+from gapcert_symbolic.thresholds import THRESHOLDS
 
 from .problem import Problem, Solution
 
@@ -28,7 +29,6 @@ Marks = npt.NDArray[np.int8]
 Counts = tuple[int, ...]  # a tuple: loops over axes are unrolled, which halves the time
 PAD = 1e-7  # of a cell, above all rounding of indices
 STRETCH = 256
-INPUTS = 64  # above, tables are shared by inputs and pay
 
 
 class Maps(NamedTuple):
@@ -51,11 +51,11 @@ def solve(problem: Problem) -> Solution | None:
 
 
 def maps(bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance | None, allowed: Bools | None) -> Maps | None:
-    """None where f is not known to be affine, up to LEAK cells over the grid, with slopes that can be inverted; or where inputs
-    are many, the gap differs between cells, or tables are small.
+    """None where f is not known to be affine, up to `axis_leak` cells over the grid, with slopes that can be inverted; or where
+    inputs are many, the gap differs between cells, or tables are small.
     """
     points, n = corners(list(axes), list(axes))[0], len(grid.counts)
-    if len(points) > INPUTS or any(grid.wraps) or grid.frame is not None or allowed is not None:
+    if len(points) > THRESHOLDS.affine_inputs or any(grid.wraps) or grid.frame is not None or allowed is not None:
         return None
     if added is not None and added.r.lo.shape[:2] != (1, 1):
         return None
@@ -72,10 +72,10 @@ def maps(bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance |
     # Replacing the slope by its middle costs half its width over the grid.
     leak = (slope.rad * (high - low)).sum(axis=-1) / widths
     beta = np.asarray(slope.mid * widths / widths[:, None])
-    if not (leak <= LEAK).all() or not (number := float(np.linalg.cond(beta).max())) < 1e6:
+    if not (leak <= THRESHOLDS.axis_leak).all() or not (number := float(np.linalg.cond(beta).max())) < 1e6:
         return None
     # Where all axes move with the own cell their tables are small, and many cells are looked at at once.
-    if (np.abs(np.einsum("jkk->jk", beta) - 1) * np.array(grid.counts) <= LEAK).all():
+    if (np.abs(np.einsum("jkk->jk", beta) - 1) * np.array(grid.counts) <= THRESHOLDS.axis_leak).all():
         return None
     cell = [np.repeat(end, len(points), axis=0) for end in grid.cells(0, 1)]
     box = bound.over(cell[0], cell[1], points)

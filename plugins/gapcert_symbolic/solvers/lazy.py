@@ -21,15 +21,15 @@ from gapcert_symbolic.cells.abstraction import EPS, size_of, touched
 from gapcert_symbolic.cells.bounds import Bound, Grown
 from gapcert_symbolic.cells.gaps import Disturbance, fitted
 from gapcert_symbolic.cells.grid import Grid, View, corners
-from gapcert_symbolic.cells.nominal import FEW, Nominal
+from gapcert_symbolic.cells.nominal import Nominal
 from gapcert_symbolic.cells.structure import Part, structure
 from gapcert_symbolic.kernels import lazy_kernels as kernels
 from gapcert_symbolic.kernels.kernels import Bits, _strides
 from gapcert_symbolic.kernels.lazy_kernels import Cells, Small, Tree, Watch
+from gapcert_symbolic.thresholds import THRESHOLDS
 
 from .problem import Problem, Solution
 
-PARTS = 8  # blocks along the longest axis to begin with, or some more
 PAIRS = 400_000
 LEAST = 1 << 15  # entries that arrays have room for, once they grow
 Ask = Callable[[Small, Small, Small, Small], tuple[Small, Small]]
@@ -108,7 +108,9 @@ def suits(bound: Bound, grid: Grid, axes: tuple[Array, ...]) -> bool:
     if not bound.groups:
         return True
     # Where inputs cannot share f in some cells, they cannot in all.
-    some = np.linspace(0, grid.size - 1, min(grid.size, FEW // math.prod(len(a) for a in axes) + 1)).astype(np.int64)
+    some = np.linspace(0, grid.size - 1, min(grid.size, THRESHOLDS.single_pairs // math.prod(len(a) for a in axes) + 1)).astype(
+        np.int64
+    )
     return Nominal.coarsest(bound, View(grid, tuple(range(len(grid.counts))), some), axes).direct
 
 
@@ -145,7 +147,7 @@ def _half(grid: Grid, size: int) -> Array:
 def _sizes(longest: int) -> list[int]:
     """Cells per axis of the blocks of each level, down to 1."""
     sizes = [1]
-    while sizes[-1] * kernels.FACTOR * PARTS <= longest:
+    while sizes[-1] * kernels.FACTOR * THRESHOLDS.first_blocks <= longest:
         sizes.append(sizes[-1] * kernels.FACTOR)
     return sizes
 

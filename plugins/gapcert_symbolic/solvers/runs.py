@@ -28,11 +28,11 @@ from gapcert_symbolic.kernels.kernels import (
     part,
     together,
 )
+from gapcert_symbolic.thresholds import THRESHOLDS
 
 from .problem import Problem, Solution
 
 Runs = npt.NDArray[np.int32]
-MOST = 4  # threads: each takes four bytes per cell
 BLOCK = 1 << 12  # rows whose differences are taken at once: chosen for memory, not measured
 ROOM = 36  # rows of what each thread counts in, of which four are used: the rest keeps what threads write to apart
 
@@ -285,7 +285,7 @@ def _shared(game: Game, cells: int, threads: int) -> tuple[int, Any, list[Own], 
     """`_sense`, or 0 where relations decide; the runs of all threads; and what each thread has, and its rows."""
     sense, counts = 0 if game.allowed.size else _sense(game), game.counts
     # With one axis a run passes from one thread's cells into another's.
-    parts = 1 if len(counts) == 1 else min(threads, MOST, int(counts[0]))
+    parts = 1 if len(counts) == 1 else min(threads, THRESHOLDS.run_threads, int(counts[0]))
     runs, rooms = np.empty((parts, cells), np.int32), np.zeros((parts, ROOM, len(counts)), np.int64)
     known = np.zeros((parts, 2, 0 if sense else counts[-1]), np.int64)
     own = [Own(runs[p], rooms[p, 0], rooms[p, 1:4], known[p]) for p in range(parts)]

@@ -11,18 +11,19 @@ from gapcert.plugin import Bools
 from gapcert_symbolic.cells import repeats
 from gapcert_symbolic.kernels import inverse, reach
 from gapcert_symbolic.kernels.kernels import Bits, Values, whole
+from gapcert_symbolic.thresholds import THRESHOLDS
 
 from . import affine, dense, erosion, lazy, runs
 from .problem import Problem, Solution
 
-LARGE = 1 << 26  # pairs of a cell and an input: with fewer, to give threads their parts takes longer than they save
 Solver = Callable[[Problem], Solution | None]
 """None where a problem does not suit it."""
 
 
 def usable(asked: int | None, pairs: int) -> int:
-    """How many threads are used for so many pairs of a cell and an input: as asked, else one per core from LARGE on."""
-    return asked or (len(os.sched_getaffinity(0)) if pairs >= LARGE else 1)
+    """How many threads are used for so many pairs of a cell and an input: as asked, else one per core from `threaded_pairs`
+    on."""
+    return asked or (len(os.sched_getaffinity(0)) if pairs >= THRESHOLDS.threaded_pairs else 1)
 
 
 def solve(problem: Problem) -> Solution:

@@ -9,13 +9,11 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.systems.domain import Domain
 from gapcert.numerics.arrays import Array
 
 Index = npt.NDArray[np.intp]
-
-_PARTS = 4  # a step looks at quarters: a jump's slope then grows by 4, a settled one by 1
-_ABOVE = 16.0  # changes below so many resolutions tell nothing
 
 
 @final
@@ -73,14 +71,14 @@ def follow(
     slope = np.full((len(z), int(most.max(initial=0)) + 1), np.nan)
     slope[:, 0] = np.abs(g[rows, 1, state] - g[rows, 0, state])
     settled = np.zeros(len(z), dtype=bool)
-    t = (np.arange(1, _PARTS) / _PARTS)[:, None]
+    t = (np.arange(1, THRESHOLDS.trail_parts) / THRESHOLDS.trail_parts)[:, None]
     for k in range(slope.shape[1] - 1):
         rows = rows[most[rows] > k]
         if not len(rows):
             break
         a, b = z[rows, :1], z[rows, 1:]
         inner = np.clip(a * (1 - t) + b * t, np.minimum(a, b), np.maximum(a, b))
-        values = query(k, inner.reshape(-1, z.shape[2])).reshape(len(rows), _PARTS - 1, -1)
+        values = query(k, inner.reshape(-1, z.shape[2])).reshape(len(rows), THRESHOLDS.trail_parts - 1, -1)
         queried += inner.shape[0] * inner.shape[1]
         at = np.concatenate([g[rows, :1], values, g[rows, 1:]], axis=1)
         points = np.concatenate([a, inner, b], axis=1)
@@ -88,11 +86,11 @@ def follow(
         change = np.abs(np.diff(at[each, :, own], axis=1))
         best = change.argmax(axis=1)
         most_change = change[each, best]
-        clear = (most_change > _ABOVE * noise[own]) & (points[each, best] != points[each, best + 1]).any(axis=1)
+        clear = (most_change > THRESHOLDS.trail_clear * noise[own]) & (points[each, best] != points[each, best + 1]).any(axis=1)
         rows, each, best, most_change = rows[clear], each[clear], best[clear], most_change[clear]
         z[rows] = np.stack([points[each, best], points[each, best + 1]], axis=1)
         g[rows] = np.stack([at[each, best], at[each, best + 1]], axis=1)
-        slope[rows, k + 1] = most_change * float(_PARTS) ** (k + 1)
+        slope[rows, k + 1] = most_change * float(THRESHOLDS.trail_parts) ** (k + 1)
         if enough is not None and k > 0:
             settled[rows] = slope[rows, k + 1] <= enough[rows]
             rows = rows[~settled[rows]]

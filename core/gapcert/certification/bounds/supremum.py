@@ -8,14 +8,12 @@ from typing import final
 
 import numpy as np
 
+from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.gaps.gap import GapFunction
 from gapcert.contracts.plugins.events import Pulse
 from gapcert.contracts.systems.domain import Domain
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.intervals import Interval
-
-_BATCH = 2048
-_PROBES = 64
 
 
 def supremum(
@@ -91,7 +89,7 @@ def _supremum(
         if not len(boxes) or spent >= budget:
             return max(settled, bound.max(initial=0.0)), lower
         order = np.argsort(-bound, kind="stable")
-        first, rest = order[:_BATCH], order[_BATCH:]
+        first, rest = order[: THRESHOLDS.supremum_batch], order[THRESHOLDS.supremum_batch :]
         halves, parents = split(boxes[first], gap.lipschitz(boxes[first])[:, i]), np.tile(bound[first], 2)
         spent += len(halves)
         seen.add(len(halves), i, max(settled, float(bound[first[0]])), lower)
@@ -100,7 +98,7 @@ def _supremum(
             halves, parents = halves[meets], parents[meets]
         # A half lies inside its parent, so the parent's bound holds for it as well.
         tighter = np.minimum(gap.gamma_of(halves, i), parents)
-        lower = max(lower, _reached(gap, domain, halves[np.argsort(-tighter)[:_PROBES]], i))
+        lower = max(lower, _reached(gap, domain, halves[np.argsort(-tighter)[: THRESHOLDS.supremum_probes]], i))
         boxes, bound = Interval.concatenate([boxes[rest], halves]), np.concatenate([bound[rest], tighter])
 
 

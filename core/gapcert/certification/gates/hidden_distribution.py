@@ -14,13 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.certification.gates.hidden_probes import Pool, Range, columns
+from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.systems.system import Backend, Model, System, difference
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.counter_rng import Keys, keys, uniforms
 from gapcert.numerics.digest import json_digest
 from gapcert.numerics.errors import UsageError
-
-_VERTICES = 64
 
 
 class Law(ABC):
@@ -78,10 +77,10 @@ class Ranges(Law):
 
     def extremes(self, x: Array, count: int) -> list[Array]:
         """Half of them vertices of the box, half inside it."""
-        ends = list(itertools.islice(itertools.product((0.0, 1.0), repeat=len(self.index)), _VERTICES))
+        ends = list(itertools.islice(itertools.product((0.0, 1.0), repeat=len(self.index)), THRESHOLDS.hidden_vertices))
         rng = np.random.default_rng(len(self.index))
-        if 2 ** len(self.index) > _VERTICES:
-            ends = [tuple(v) for v in rng.integers(0, 2, (_VERTICES, len(self.index))).astype(float)]
+        if 2 ** len(self.index) > THRESHOLDS.hidden_vertices:
+            ends = [tuple(v) for v in rng.integers(0, 2, (THRESHOLDS.hidden_vertices, len(self.index))).astype(float)]
         picked = rng.permutation(len(ends))[: max(2, count // 2)]
         shares = [np.asarray(ends[k]) for k in picked] + list(rng.random((count - len(picked), len(self.index))))
         out = []

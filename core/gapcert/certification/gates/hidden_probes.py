@@ -10,16 +10,12 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.systems.domain import Domain
 from gapcert.contracts.systems.system import StateSpec, System, difference, rotated
 from gapcert.numerics.arrays import Array
 
 Range = tuple[float, float]
-
-_SIZE = 0.1
-"""How far a hidden number is moved where no range is declared: 0.1 rad, m, rad/s, …; 1 where it has no unit (a count)."""
-
-_CANDIDATES = 64
 
 
 def columns(specs: tuple[StateSpec, ...]) -> list[slice]:
@@ -48,12 +44,12 @@ def moved(
         if only is not None and spec.name not in only:
             continue
         if spec.kind == "quaternion":
-            h[:, part] = rotated(h[:, part], _SIZE * axis / np.linalg.norm(axis, axis=1, keepdims=True))
+            h[:, part] = rotated(h[:, part], THRESHOLDS.hidden_move * axis / np.linalg.norm(axis, axis=1, keepdims=True))
         elif ranges is not None and spec.name in ranges:
             low, high = ranges[spec.name]
             h[:, part] = np.where(sign > 0, high, low)[:, None]
         else:
-            h[:, part] += (sign * (1.0 if spec.unit == "1" else _SIZE))[:, None]
+            h[:, part] += (sign * (1.0 if spec.unit == "1" else THRESHOLDS.hidden_move))[:, None]
     return h
 
 
@@ -102,7 +98,7 @@ def visited(
 def inputs(domain: Domain, x: Array, rng: np.random.Generator) -> tuple[Array, npt.NDArray[np.bool_]]:
     """u (n, nu) with (x, u) in the domain, and where there is one: the first that fits of 64 uniform ones per row."""
     low, width = domain.low[domain.nx :], domain.width[domain.nx :]
-    tried = low + width * rng.random((len(x), _CANDIDATES, len(low)))
+    tried = low + width * rng.random((len(x), THRESHOLDS.hidden_candidates, len(low)))
     z = np.concatenate([np.broadcast_to(x[:, None], (*tried.shape[:2], x.shape[1])), tried], axis=2)
     fits = domain.contains(z.reshape(-1, z.shape[2])).reshape(z.shape[:2])
     return tried[np.arange(len(x)), fits.argmax(axis=1)], np.asarray(fits.any(axis=1))

@@ -11,6 +11,7 @@ import numpy as np
 from gapcert.certification.gates.augment import Augmented
 from gapcert.certification.gates.hidden_distribution import HiddenDraws, Law, Ranges, Visited
 from gapcert.certification.gates.hidden_probes import Pool, Range, change, columns, inputs, moved, visited
+from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.gaps.gap import GapFunction, GapProblem
 from gapcert.contracts.gaps.lipschitz import Residual
 from gapcert.contracts.plugins.events import Emit, Pulse, silent
@@ -21,12 +22,7 @@ from gapcert.numerics.errors import UsageError
 
 Mode = Literal["refuse", "augment", "default", "sample"]
 
-_HARMLESS = 4
-"""Both answers of a spread may err by the resolution e of f̂ and of f: what differs by 4 e or less may be rounding."""
 
-_QUERIES, _TOGETHER = 384, 48
-_RUNS, _STEPS = 24, 12
-_POINTS, _DRAWS = 64, 16
 _BLOCK = 64  # rows of an attack between two signs of life
 
 
@@ -74,13 +70,13 @@ class Probe:
 
     @property
     def harmless(self) -> bool:
-        return bool((self.spread <= _HARMLESS * self.e).all())
+        return bool((self.spread <= THRESHOLDS.harmless * self.e).all())
 
     def ranked(self) -> list[tuple[str, Array]]:
         """Hidden states that matter alone, the one with the largest spread beside the mean gap first."""
         beside = (self.each / np.maximum(self.gap, self.e)).max(axis=1)
         order = np.argsort(-beside, kind="stable")
-        return [(self.names[k], self.each[k]) for k in order if (self.each[k] > _HARMLESS * self.e).any()]
+        return [(self.names[k], self.each[k]) for k in order if (self.each[k] > THRESHOLDS.harmless * self.e).any()]
 
 
 @final
@@ -174,7 +170,8 @@ def open_gate(
         plan = replace(plan, mode="augment")
     if not backend.hidden:
         return Gate(plan, backend, states, augmented, none)
-    pool = visited(backend, domain, _RUNS, _STEPS, seed, lambda k: tell(f"rollouts, step {k + 1} of {_STEPS}"))
+    steps = THRESHOLDS.hidden_steps
+    pool = visited(backend, domain, THRESHOLDS.hidden_runs, steps, seed, lambda k: tell(f"rollouts, step {k + 1} of {steps}"))
     tell("moved at random points")
     probed = probe(Residual(backend, model), domain, plan.ranges, pool, seed)
     if probed.harmless or plan.mode == "default":
@@ -184,7 +181,8 @@ def open_gate(
     law = _law(probed, backend, domain, plan, states, seed, tell)
     draws = HiddenDraws(backend, law, seed)
     bound, names = plan.safety * spread(draws, domain, seed), tuple(plan.ranges) or names
-    spent = _POINTS * _DRAWS if plan.ranges else plan.runs * plan.steps + _POINTS * plan.near
+    points = THRESHOLDS.spread_points
+    spent = points * THRESHOLDS.spread_draws if plan.ranges else plan.runs * plan.steps + points * plan.near
     return Gate(plan, draws, states, names, bound, probed, law, spent=spent)
 
 
@@ -213,8 +211,8 @@ def probe(residual: Residual, domain: Domain, ranges: Mapping[str, Range], pool:
     """Hidden states moved alone, all together, and as visited, at random (x, u); all queries in one batch."""
     backend, rng = residual.backend, np.random.default_rng([seed, 0x41DE])
     names = tuple(s.name for s in backend.hidden)
-    rows = max(4, min(24, _QUERIES // len(names)))
-    z = domain.draw(_TOGETHER, rng)
+    rows = max(4, min(24, THRESHOLDS.hidden_queries // len(names)))
+    z = domain.draw(THRESHOLDS.hidden_together, rng)
     x, u = (np.ascontiguousarray(part) for part in domain.split(z))
     groups = [(x[:rows], u[:rows], moved(backend, rows, rng, ranges, (n,))) for n in names]
     groups.append((x, u, moved(backend, len(x), rng, ranges)))
@@ -235,10 +233,13 @@ def probe(residual: Residual, domain: Domain, ranges: Mapping[str, Range], pool:
     k = int(np.argmax((d / np.maximum(gap, e)).max(axis=1)))
     witness = {"x": at[0][k], "u": at[1][k], "hidden": at[2][k], "default": plain[k], "moved": other[k]}
     lists = {key: value.tolist() for key, value in witness.items()}
-    return Probe(names, largest[:-2], largest[-2], largest[-1], gap, e, lists, 2 * len(d) + _RUNS * _STEPS)
+    spent = 2 * len(d) + THRESHOLDS.hidden_runs * THRESHOLDS.hidden_steps
+    return Probe(names, largest[:-2], largest[-2], largest[-1], gap, e, lists, spent)
 
 
-def _met(domain: Domain, pool: Pool, rng: np.random.Generator, most: int = _TOGETHER) -> tuple[Array, Array, Array]:
+def _met(
+    domain: Domain, pool: Pool, rng: np.random.Generator, most: int = THRESHOLDS.hidden_together
+) -> tuple[Array, Array, Array]:
     """(x, u, h) of up to `most` visited states, each with a new input."""
     pick = rng.permutation(len(pool))[:most]
     u, inside = inputs(domain, pool.x[pick], rng)
@@ -247,8 +248,9 @@ def _met(domain: Domain, pool: Pool, rng: np.random.Generator, most: int = _TOGE
 
 def spread(draws: HiddenDraws, domain: Domain, seed: int) -> Array:
     """s (nx,): half the largest difference between two draws at one (x, u), over 64 points and 16 or so draws at each."""
-    x, u = (np.ascontiguousarray(p) for p in domain.split(domain.draw(_POINTS, np.random.default_rng([seed, 0x59D]))))
-    hs = draws.law.extremes(x, _DRAWS)
+    z = domain.draw(THRESHOLDS.spread_points, np.random.default_rng([seed, 0x59D]))
+    x, u = (np.ascontiguousarray(p) for p in domain.split(z))
+    hs = draws.law.extremes(x, THRESHOLDS.spread_draws)
     after = draws.system.step(np.tile(x, (len(hs), 1)), np.tile(u, (len(hs), 1)), hidden=np.vstack(hs)).x
     after = after.reshape(len(hs), len(x), -1)
     # Differences to the first draw: on the circle, a mean or a range of the angles themselves would have no meaning.
@@ -266,13 +268,13 @@ def attacked(gate: Gate, gap: GapFunction, problem: GapProblem, model: Model, em
         return gate
     backend, domain, rng = gate.system, problem.domain, np.random.default_rng([problem.seed, 0xA77AD])
     x, u = (np.ascontiguousarray(part) for part in domain.split(domain.draw(n, rng)))
-    pulse = Pulse(emit, "attack", _STEPS + -(-2 * n // _BLOCK), "steps", "from other hidden states")
-    met = visited(backend, domain, max(_RUNS, n // 8), _STEPS, problem.seed + 2, pulse)
+    pulse = Pulse(emit, "attack", THRESHOLDS.hidden_steps + -(-2 * n // _BLOCK), "steps", "from other hidden states")
+    met = visited(backend, domain, max(THRESHOLDS.hidden_runs, n // 8), THRESHOLDS.hidden_steps, problem.seed + 2, pulse)
     parts = [(x, u, moved(backend, n, rng, gate.plan.ranges)), _met(domain, met, rng, n)]
     x, u, h = (np.concatenate(part) for part in zip(*parts, strict=True))
     gamma, after = gap.gamma(np.hstack([x, u])), []
     for first in range(0, len(x), _BLOCK):
-        pulse(_STEPS + first // _BLOCK)
+        pulse(THRESHOLDS.hidden_steps + first // _BLOCK)
         block = slice(first, first + _BLOCK)
         after.append(backend.step(x[block], u[block], hidden=h[block]).x)
     r = difference(model.states, np.concatenate(after), model.step(x, u).x)
@@ -304,7 +306,7 @@ def _refusal(p: Probe, augmenting: bool, states: Sequence[str], backend: System)
     w = p.witness
     parts = [_spreads(p, states)]
     for how, values in (("all together", p.together), ("as visited in rollouts", p.met)):
-        parts.append(f"{how} they move {_by(states, values, p.gap)}" if (values > _HARMLESS * p.e).any() else "")
+        parts.append(f"{how} they move {_by(states, values, p.gap)}" if (values > THRESHOLDS.harmless * p.e).any() else "")
     found = "; ".join(filter(None, parts))
     head = (
         f"certify: the backend depends on hidden state ({', '.join(names)}), so its gap is no function of (x, u): {found}. "

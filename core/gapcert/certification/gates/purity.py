@@ -16,13 +16,11 @@ import numpy.typing as npt
 
 from gapcert.certification.gates.hidden_probes import moved
 from gapcert.certification.samples.executors import processes
+from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.systems.domain import Domain
 from gapcert.contracts.systems.system import Step, System, difference
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.errors import UsageError
-
-_ROWS = 64
-_HELD_AT_MOST = 512
 
 
 @final
@@ -44,7 +42,7 @@ class Queries:
 def queries(system: System, domain: Domain, seed: int) -> Queries:
     """64 random rows of the domain, and its centre; hidden states are moved as well, since purity is about all arguments."""
     rng = np.random.default_rng([seed, 0x9075])
-    z = np.vstack([domain.draw(_ROWS, rng), domain.centre])
+    z = np.vstack([domain.draw(THRESHOLDS.purity_rows, rng), domain.centre])
     x, u = (np.ascontiguousarray(part) for part in domain.split(z))
     return Queries(x, u, moved(system, len(x), rng) if system.hidden else None)
 
@@ -93,7 +91,7 @@ def _here(system: System, rows: Queries, seed: int) -> Iterator[tuple[str, Any, 
 
 def _held(system: System, rows: Queries, first: Step) -> Iterator[tuple[str, Any, Step]]:
     """One row asked over and over: an engine that puts slow bodies to sleep counts, over half a second to two, while it is."""
-    times = min(_HELD_AT_MOST, max(4, math.ceil(2.5 / system.period)))
+    times = min(THRESHOLDS.held_periods, max(4, math.ceil(2.5 / system.period)))
     move = np.abs(difference(system.states, first.x, rows.x)).sum(axis=1)
     slowest = int(np.argmin(np.where(move > 0, move, np.inf)))
     for k in {slowest, len(rows.x) - 1}:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.gaps.lipschitz import Residual
 from gapcert.contracts.systems.domain import Domain
 from gapcert.contracts.systems.system import difference
-
-_TOLERANCE = 0.1
-_ROWS = 16
 
 
 def responses(residual: Residual, domain: Domain, seed: int) -> list[str]:
@@ -20,7 +18,7 @@ def responses(residual: Residual, domain: Domain, seed: int) -> list[str]:
     inertia or gain. A certificate stays true then, and its γ is large.
     """
     model, said = residual.model, []
-    z = domain.draw(_ROWS, np.random.default_rng([seed, 0x2E5]))
+    z = domain.draw(THRESHOLDS.response_rows, np.random.default_rng([seed, 0x2E5]))
     if not domain.relations:
         z[:, domain.nx :] = (domain.low + domain.high)[domain.nx :] / 2
     resolution = residual.resolution(domain)
@@ -42,7 +40,7 @@ def responses(residual: Residual, domain: Domain, seed: int) -> list[str]:
                     f"{state.name} of f̂ does not answer to {spec.name} at all, and that of f does; look for a motor or a lock "
                     f"that holds the joint, or a wrong joint name"
                 )
-            elif abs(ratio - 1) > _TOLERANCE:
+            elif abs(ratio - 1) > THRESHOLDS.response_error:
                 said.append(
                     f"{spec.name} moves {state.name} of f̂ {ratio:.2g} times as far as that of f; look for another time step, "
                     f"inertia or gain, unless that is the question"

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple, final
 import numpy as np
 
 from gapcert.certification.samples.extremes import Extremes
+from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.systems.domain import Cover, Domain, Points
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.constraint_zone import centres, edges
@@ -21,9 +22,6 @@ from gapcert.numerics.intervals import Interval
 
 if TYPE_CHECKING:
     from gapcert.contracts.gaps.lipschitz import LipschitzBound
-
-
-_SPREAD = 300  # points of a grid where nobody asks for another; chosen, not measured
 
 
 class Sampling(ABC):
@@ -87,8 +85,8 @@ class GridSampling(Sampling):
 
     @classmethod
     def spread(cls, domain: Domain) -> GridSampling:
-        """About `_SPREAD` points, evenly: where residuals have noise, no cell is known to be looser than another."""
-        return cls((max(2, round(_SPREAD ** (1 / len(domain.low)))),) * len(domain.low))
+        """About `spread_grid` points, evenly: where residuals have noise, no cell is known to be looser than another."""
+        return cls((max(2, round(THRESHOLDS.spread_grid ** (1 / len(domain.low)))),) * len(domain.low))
 
     def holding(self, held: Sequence[int]) -> GridSampling:
         def one(counts: tuple[int, ...]) -> tuple[int, ...]:

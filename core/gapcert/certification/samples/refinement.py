@@ -7,13 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.gaps.gap import GapFunction, GapProblem
 from gapcert.contracts.gaps.predictor import Samples
 from gapcert.contracts.plugins.registry import registry
 from gapcert.numerics.arrays import Array
-
-_ROUNDS = 8  # names of rounds are sorted as texts
-_POINTS = 4_000  # at which the band is looked at, which costs no simulation
 
 
 def refined(problem: GapProblem, further: Array, tightness: float | None, query: Callable[[str, Array], Array]) -> Samples:
@@ -41,8 +39,8 @@ def refined(problem: GapProblem, further: Array, tightness: float | None, query:
 
 def _ends(first: int, least: int, count: int) -> list[int]:
     """How many of the further samples there are after each round."""
-    ratio = max(2.0, ((first + count) / first) ** (1 / _ROUNDS))
-    ends = first * ratio ** np.arange(1, _ROUNDS + 1) - first
+    ratio = max(2.0, ((first + count) / first) ** (1 / THRESHOLDS.refinement_rounds))
+    ends = first * ratio ** np.arange(1, THRESHOLDS.refinement_rounds + 1) - first
     return sorted({int(np.clip(e, min(least, count), count)) for e in ends} | {count})
 
 
@@ -52,7 +50,10 @@ class _Watch:
     """
 
     def __init__(self, problem: GapProblem) -> None:
-        self.problem, self.z = problem, problem.domain.draw(_POINTS, np.random.default_rng([problem.seed, 0x7167]))
+        self.problem, self.z = (
+            problem,
+            problem.domain.draw(THRESHOLDS.refinement_points, np.random.default_rng([problem.seed, 0x7167])),
+        )
         self.low: float | Array = -np.inf
         self.high: float | Array = np.inf
 

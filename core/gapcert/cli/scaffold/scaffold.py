@@ -25,7 +25,7 @@ from gapcert.numerics.errors import UsageError
 from gapcert.spec.check import COMPONENTS
 
 _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
-_LONGEST = 30
+_LONGEST = 30  # characters of a name; chosen, not measured
 
 
 @final

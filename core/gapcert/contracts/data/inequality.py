@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 from typing import final
 
 from gapcert.contracts.data.units import magnitude
+from gapcert.contracts.thresholds import THRESHOLDS
 from gapcert.numerics.constraint_zone import Relation
 
 _TOKEN = re.compile(
     r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)|(?P<name>[^\W\d]\w*)|(?P<sign><=|>=|\*\*|[-+*/^()<>=]))"
 )
-_MOST = 8  # inequalities that one text may stand for
 
 
 @final
@@ -67,7 +67,7 @@ def parse(text: str, units: Mapping[str, str]) -> tuple[Relation, ...]:
     if bent := next((t for t in terms if t.inside and t.factor < 0), None):
         raise MalformedError("a lower bound on abs(...) leaves two pieces", bent.at, "bound it from above")
     folds = [t for t in terms if t.inside]
-    if 2 ** len(folds) > _MOST:
+    if 2 ** len(folds) > THRESHOLDS.relation_texts:
         raise MalformedError(f"{len(folds)} times abs(...) in one relation", folds[3].at, "split it into several")
     found = []
     for signs in itertools.product((1.0, -1.0), repeat=len(folds)):

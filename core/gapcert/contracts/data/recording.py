@@ -16,6 +16,7 @@ from typing import Any, ClassVar, Literal, final
 import numpy as np
 
 from gapcert.contracts.data.units import stated_units
+from gapcert.contracts.thresholds import THRESHOLDS
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.errors import UsageError, clipped
 
@@ -57,7 +58,6 @@ def _lacking(value: Any) -> bool:
 
 
 SHORTEST = 16  # samples: below this no noise floor can be estimated
-EPOCH = 1e6  # s: later times count from some epoch, and are counted from their first instead
 Hold = Literal["zero", "first"]
 HELD = ("diagnose", "hold_out")  # where a spec says what is held out
 
@@ -366,7 +366,7 @@ def seconds(table: str, column: str, values: Any, unit: str, place: Place = coun
     whole = raw.dtype.kind in "iu"
     numbers = raw.astype(np.int64) if whole else _numbers(table, column, values, place)
     finite = numbers[np.isfinite(numbers)]
-    if len(finite) and float(finite[0]) * factor > EPOCH:
+    if len(finite) and float(finite[0]) * factor > THRESHOLDS.epoch:
         numbers = numbers - finite[0]
     return np.asarray(numbers, dtype=np.float64) * factor
 

@@ -11,10 +11,9 @@ import numpy as np
 from gapcert.contracts.gaps.lipschitz import LipschitzBound, LipschitzProblem
 from gapcert.contracts.gaps.predictor import Predictor
 from gapcert.contracts.systems.domain import Domain
+from gapcert.contracts.thresholds import THRESHOLDS
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.errors import UsageError
-
-PAIRS = 500
 
 
 @final
@@ -55,7 +54,7 @@ class Symmetry:
         return {"axes": list(self.axes), "names": list(self.names), "pairs": self.pairs, "deviation": list(self.deviation)}
 
 
-def checked(names: Sequence[str], problem: LipschitzProblem, pairs: int = PAIRS) -> Symmetry:
+def checked(names: Sequence[str], problem: LipschitzProblem, pairs: int = THRESHOLDS.symmetry_pairs) -> Symmetry:
     """The symmetry under shifts along named axes; UsageError with the worst pair where r changes by more than 4 e.
 
     Points are drawn from Z, their partners differ along the axes, uniformly. Each computed residual errs by at most e, and r

@@ -11,6 +11,7 @@ import numpy as np
 
 from gapcert.contracts.systems.domain import Box
 from gapcert.contracts.systems.system import StateSpec
+from gapcert.contracts.thresholds import THRESHOLDS
 from gapcert.numerics.arrays import Array, Bools
 from gapcert.numerics.constraint_zone import Relation, Zone
 from gapcert.numerics.errors import UsageError
@@ -18,8 +19,6 @@ from gapcert.numerics.intervals import Interval
 
 TURN = 2 * np.pi
 _ROUND = 1e-12  # relative: an eigenvalue below it may be rounding
-_SWEEPS = 40
-_MOST = 8  # states of an ellipsoid: a cell has two to their number corners
 
 
 def turned(box: Box, x: Array) -> Array:
@@ -91,8 +90,11 @@ class Ellipsoid:
     def __post_init__(self) -> None:
         m = np.asarray(self.matrix, dtype=np.float64)
         k = len(self.on)
-        if not 1 <= k <= _MOST or m.shape != (k, k) or len(self.centre) != k or not np.isfinite(m).all():
-            raise UsageError(f"ellipsoid: 1 to {_MOST} states are needed, a finite centre and a square matrix over them")
+        if not 1 <= k <= THRESHOLDS.ellipsoid_states or m.shape != (k, k) or len(self.centre) != k or not np.isfinite(m).all():
+            raise UsageError(
+                f"ellipsoid: 1 to {THRESHOLDS.ellipsoid_states} states are needed, a finite centre and a "
+                "square matrix over them"
+            )
         least, most = np.linalg.eigvalsh(m)[[0, -1]]
         if not np.array_equal(m, m.T) or not least > _ROUND * most:
             raise UsageError("ellipsoid: the matrix is not symmetric and positive definite; give radii, or another matrix")
@@ -143,7 +145,7 @@ class Ellipsoid:
         def meets(low: Array, high: Array) -> Bools:
             a, b = low[:, self.on], high[:, self.on]
             y = np.clip(self.centre, a, b)
-            for i in [*range(k)] * (_SWEEPS if k > 1 else 0):
+            for i in [*range(k)] * (THRESHOLDS.region_sweeps if k > 1 else 0):
                 rest = (y - self.centre) @ m[i] - m[i, i] * (y[:, i] - self.centre[i])
                 y[:, i] = np.clip(self.centre[i] - rest / m[i, i], a[:, i], b[:, i])
             zero = Interval.exact(np.zeros(len(y)))

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, final
 
 from gapcert.numerics.errors import UsageError
+from gapcert.spec.thresholds import THRESHOLDS
 
 SCHEMA = Path(".gapcert") / "spec.schema.json"
 SETTINGS = Path(".vscode") / "settings.json"
@@ -18,7 +19,6 @@ MATCH = ("specs/**/*.yaml", "**/*.gapcert.yaml")
 MODELINE = "# yaml-language-server: $schema="
 _SKIPPED = {"node_modules", "runs", "build", "dist", "site-packages", "__pycache__"}
 _SPEC = re.compile(r"^version: *1 *(?:#.*)?$", re.MULTILINE), re.compile(r"^name: *\S", re.MULTILINE)
-_LARGEST, _DEEPEST = 1 << 20, 4
 
 
 @final
@@ -112,7 +112,7 @@ def _settings(folder: Path) -> tuple[dict[str, Any], str]:
 def _others(folder: Path) -> Iterator[str]:
     """Specs that lie where no pattern finds them, as deep as one is likely to look."""
     for where, folders, names in os.walk(folder):
-        deep = len(Path(where).relative_to(folder).parts) >= _DEEPEST
+        deep = len(Path(where).relative_to(folder).parts) >= THRESHOLDS.editor_depth
         folders[:] = [] if deep else sorted(f for f in folders if f not in _SKIPPED and not f.startswith("."))
         for path in (Path(where, name) for name in names if name.endswith(".yaml") and not name.endswith(".gapcert.yaml")):
             inside = path.relative_to(folder)
@@ -123,7 +123,7 @@ def _others(folder: Path) -> Iterator[str]:
 def _is_spec(path: Path) -> bool:
     """Does it look like one? What cannot be read does not."""
     try:
-        text = path.read_text(encoding="utf-8", errors="replace") if path.stat().st_size < _LARGEST else ""
+        text = path.read_text(encoding="utf-8", errors="replace") if path.stat().st_size < THRESHOLDS.editor_bytes else ""
     except OSError:
         return False
     return all(pattern.search(text) for pattern in _SPEC)

@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from gapcert.spec.text.source import At, Key, Mark, Problem, Source, Tree, failure, parse, read
-
-LONGEST_CHAIN, MOST_VARIANTS, MOST_FILES = 32, 10_000, 20_000
+from gapcert.spec.thresholds import THRESHOLDS
 
 
 def load_tree(path: Path) -> Tree:
@@ -52,14 +51,14 @@ def matching(path: Path) -> list[Path]:
 def inside(folder: Path) -> list[Path]:
     """The files of a folder (a bag, a data set; not its videos), and never more than one over what a folder may have."""
     found = (p for p in folder.rglob("*") if p.suffix not in (".mp4", ".png") and regular(p))
-    return sorted(itertools.islice(found, MOST_FILES + 1))
+    return sorted(itertools.islice(found, THRESHOLDS.folder_files + 1))
 
 
 def crowded(folder: Path) -> str:
     """Why a folder cannot be the data of a spec, or ""."""
     if folder.resolve().parts[1:2] in (("proc",), ("sys",), ("dev",)):
         return "belongs to the system"
-    return f"has more than {MOST_FILES:,} files" if len(inside(folder)) > MOST_FILES else ""
+    return f"has more than {THRESHOLDS.folder_files:,} files" if len(inside(folder)) > THRESHOLDS.folder_files else ""
 
 
 def read_nothing(label: str) -> Tree:
@@ -79,8 +78,10 @@ def extend(tree: Tree, folder: Path, seen: tuple[Path, ...] = ()) -> Tree:
         raise failure([Problem(("extends",), f"no file '{name}'", "paths are relative to the spec that names them")], tree)
     if path.resolve() in seen:
         raise failure([Problem(("extends",), f"'{name}' extends this file", "break the circle")], tree)
-    if len(seen) > LONGEST_CHAIN:
-        raise failure([Problem(("extends",), f"more than {LONGEST_CHAIN} files extend each other", "merge some")], tree)
+    if len(seen) > THRESHOLDS.extending_files:
+        raise failure(
+            [Problem(("extends",), f"more than {THRESHOLDS.extending_files} files extend each other", "merge some")], tree
+        )
     base = extend(read(path), path.parent, (*seen, path.resolve()))
     data = merge(base.data, {k: v for k, v in tree.data.items() if k != "extends"})
     # Problems of the base that the child has overwritten are gone with their values.
@@ -175,7 +176,7 @@ def matrix_problems(data: Any) -> list[Problem]:
     if not isinstance(data["matrix"], Mapping) or not data["matrix"]:
         return [Problem(("matrix",), "expected a mapping of at least one path", hint)]
     if _many(data["matrix"]):
-        return [Problem(("matrix",), f"it stands for more than {MOST_VARIANTS:,} specs", "split it")]
+        return [Problem(("matrix",), f"it stands for more than {THRESHOLDS.matrix_specs:,} specs", "split it")]
     return [
         Problem(("matrix", name), "expected a list of at least one value", hint)
         for name, values in data["matrix"].items()
@@ -184,7 +185,7 @@ def matrix_problems(data: Any) -> list[Problem]:
 
 
 def _many(matrix: Mapping[str, Any]) -> bool:
-    return math.prod(len(v) for v in matrix.values() if isinstance(v, list)) > MOST_VARIANTS
+    return math.prod(len(v) for v in matrix.values() if isinstance(v, list)) > THRESHOLDS.matrix_specs
 
 
 def variant_name(name: str, chosen: Mapping[str, Any]) -> str:

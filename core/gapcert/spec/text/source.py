@@ -16,13 +16,12 @@ from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from gapcert.numerics.errors import GapcertError, MissingDependency, SpecError, clipped
 from gapcert.spec.text.slips import advice
+from gapcert.spec.thresholds import THRESHOLDS
 
 Key = str | int
 At = tuple[Key, ...]
 SHOWN = 200  # characters of the line of a mistake: a spec that is all one line has its mistakes side by side
 _TAG = "tag:yaml.org,2002:"
-LARGEST, MOST, DEEPEST = 1_000_000, 20_000, 64
-"""Bytes of a file, values in it with what aliases repeat, and levels of nesting."""
 _MISTYPED = re.compile(r"did you mean '([^']+)'\?")
 _PLAIN = ("map", "seq", "str", "int", "float", "bool", "null", "timestamp", "merge")
 
@@ -157,7 +156,7 @@ def read(path: Path) -> Tree:
     label = os.path.normpath(path)
     try:
         with open(path, "rb") as file:
-            content = file.read(LARGEST + 1)
+            content = file.read(THRESHOLDS.spec_bytes + 1)
         text = content.decode("utf-8")
     except UnicodeDecodeError as error:
         raise SpecError(f"{label}: error: byte {error.start} is not UTF-8; save the spec as UTF-8 text") from None
@@ -165,17 +164,19 @@ def read(path: Path) -> Tree:
         raise SpecError(f"{label}: error: {(error.strerror or str(error)).lower()}; give the path of a spec file") from None
     except ValueError as error:  # a path that no file can have
         raise SpecError(f"{label}: error: {error}; give the path of a spec file") from None
-    if len(content) > LARGEST:
-        raise SpecError(f"{label}: error: it is larger than {LARGEST:,} bytes; a spec names its data, it does not hold them")
+    if len(content) > THRESHOLDS.spec_bytes:
+        raise SpecError(
+            f"{label}: error: it is larger than {THRESHOLDS.spec_bytes:,} bytes; a spec names its data, it does not hold them"
+        )
     return parse(Source(label, text, path.parent))
 
 
 def parse(source: Source, base: At = (), origin: tuple[int, int] = (0, 0)) -> Tree:
     """Parse YAML 1.2 text. `base` prefixes all paths; `origin` shifts the marks of a text that begins inside its source."""
     text = source.text if origin == (0, 0) else source.text[origin[1] :]
-    if _depth(text) > DEEPEST:
+    if _depth(text) > THRESHOLDS.spec_depth:
         raise _too_deep(source)
-    if text.count(",") + text.count("\n") > MOST:
+    if text.count(",") + text.count("\n") > THRESHOLDS.spec_values:
         raise _too_many(source)
     try:
         node = YAML(typ="safe", pure=True).compose(text)
@@ -208,12 +209,12 @@ def _depth(text: str) -> int:
 
 
 def _too_many(source: Source) -> SpecError:
-    what = f"it has more than {MOST:,} lines or values, what aliases repeat included"
+    what = f"it has more than {THRESHOLDS.spec_values:,} lines or values, what aliases repeat included"
     return SpecError(f"{source.label}: error: {what}; a spec names its data, it does not hold them")
 
 
 def _too_deep(source: Source) -> SpecError:
-    return SpecError(f"{source.label}: error: values are nested too deeply; a spec has at most {DEEPEST} levels")
+    return SpecError(f"{source.label}: error: values are nested too deeply; a spec has at most {THRESHOLDS.spec_depth} levels")
 
 
 @final
@@ -230,8 +231,8 @@ class _Reader:
 
     def value(self, node: Node, path: At, key: Node | None) -> Any:
         self.count += 1
-        if self.count > MOST or len(path) > DEEPEST:
-            raise _too_many(self.source) if self.count > MOST else _too_deep(self.source)
+        if self.count > THRESHOLDS.spec_values or len(path) > THRESHOLDS.spec_depth:
+            raise _too_many(self.source) if self.count > THRESHOLDS.spec_values else _too_deep(self.source)
         self.marks[path] = Mark(self.source, self.at(node), self.at(key) if key else None, self.inner(node))
         if any(node is outer for outer in self.open):
             self.problems.append(Problem(path, "an alias of the value that contains it", "write the value out"))

@@ -1,0 +1,226 @@
+"""Which thresholds that were chosen, not measured, decide an answer of the battery: each halved or doubled.
+
+All are changed at once, each halved or doubled at random, and a second time the other way round. One by one it would be two
+batteries for each of some four hundred, which takes weeks. A battery whose answers stay clears all that was changed in it, as
+far as they do not make up for each other. Where a verdict or a cause changes, halves of the changes are tried, and halves of
+these, until single thresholds are left (or a few that act together alone). They are set back, and the battery is asked again,
+until nothing changes.
+
+A share stays below 1, and of a factor between 1 and 2 the distance to 1 is halved or doubled; of a grid of values every other
+one stays, or means come between them. An answer that takes ten times as long counts as changed. Answers are kept in
+runs/thresholds.jsonl, and asked again where the code has changed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import importlib
+import itertools
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import golden
+import harness
+import numpy as np
+
+RESULTS = golden.ROOT / "runs/thresholds.jsonl"
+QUICK = ("nothing 0", "nothing 1", "faint 0", "singles 0")
+"""Questions that take some ten seconds together."""
+SECONDS = 540.0
+"""Of a quick run: what is open then goes on with the next one."""
+PATIENCE = 3600.0
+"""Seconds for an answer under no changes; others get ten times what that took, and a minute."""
+Changes = Mapping[str, Any]
+"""`module:name` → another value."""
+
+
+def tables() -> dict[str, Any]:
+    """Module → the thresholds of a room."""
+    found = sorted(path for top in ("core", "plugins") for path in (golden.ROOT / top).rglob("thresholds.py"))
+    names = [".".join(path.relative_to(golden.ROOT).with_suffix("").parts[1:]) for path in found]
+    return {name: importlib.import_module(name).THRESHOLDS for name in names}
+
+
+def changed(value: Any, up: bool) -> Any:
+    """A value halved, or doubled; in Python's own types."""
+    if isinstance(value, tuple) and len(value) > 2:
+        means = [(a + b) / 2 for a, b in itertools.pairwise(value)]
+        kept = [*value, *means] if up else value[::2]
+        return tuple(sorted({type(value[0])(v) for v in kept}, reverse=value[0] > value[-1]))
+    if isinstance(value, tuple):
+        return tuple(changed(v, up) for v in value)
+    if isinstance(value, int):
+        return 2 * value if up else max(1, round(value / 2))
+    if 0.5 <= value < 1:
+        return 1 - (1 - value) / 2 if up else value / 2
+    if 1 < value < 2:
+        return 1 + (value - 1) * (2.0 if up else 0.5)
+    return value * (2.0 if up else 0.5)
+
+
+def draws(seed: int, only: str) -> list[dict[str, Any]]:
+    """All that was chosen, changed at random, and the other way round."""
+    rooms = {name: table for name, table in tables().items() if only in name}
+    chosen = [
+        (f"{name}:{f.name}", getattr(table, f.name))
+        for name, table in rooms.items()
+        for f in fields(table)
+        if f.metadata["reason"].endswith("chosen, not measured")
+    ]
+    ways = np.random.default_rng(seed).random(len(chosen)) < 0.5
+    both = ({key: changed(v, bool(up ^ turn)) for (key, v), up in zip(chosen, ways, strict=True)} for turn in (False, True))
+    return [{key: new for (key, v) in chosen if (new := made[key]) != v} for made in both]
+
+
+def ask(question: str, changes: Changes) -> Any:
+    """In this process, in which nothing of ours has been imported yet."""
+    for key, value in changes.items():
+        name, _, threshold = key.partition(":")
+        module: Any = importlib.import_module(name)
+        module.THRESHOLDS = replace(module.THRESHOLDS, **{threshold: tuple(value) if isinstance(value, list) else value})
+    return list(told(golden.ask(question)))
+
+
+def told(answer: Any, path: str = "") -> Iterator[str]:
+    """What is compared of an answer: verdicts, what causes what, errors."""
+    if isinstance(answer, dict):
+        for key, value in answer.items():
+            if key in ("verdict", "effect", "site", "error") and isinstance(value, str):
+                yield f"{path}{key}: {value.splitlines()[0] if value else ''}"
+            elif key not in ("hidden", "classes"):
+                yield from told(value, f"{path}{key} ")
+    elif isinstance(answer, list):
+        for k, value in enumerate(answer):
+            yield from told(value, f"{path}{k} ")
+
+
+def say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+class Battery:
+    """Answers under changes, each asked in a process of its own, and kept."""
+
+    def __init__(self, questions: list[str], results: Path, until: float) -> None:
+        self.questions, self.results, self.until, self.asked = questions, results, until, 0
+        sources = sorted(path for top in ("core", "plugins") for path in (golden.ROOT / top).rglob("*.py"))
+        self.code = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
+        lines = map(json.loads, results.read_text().splitlines()) if results.exists() else ()
+        self.known: dict[str, dict[str, Any]] = {line["key"]: line for line in lines}
+
+    def answer(self, question: str, changes: Changes) -> list[str]:
+        """TimeoutError where the run has no time left."""
+        key = hashlib.sha256(json.dumps([self.code, question, changes], sort_keys=True).encode()).hexdigest()
+        if key not in self.known:
+            if time.monotonic() > self.until:
+                raise TimeoutError
+            limit = 60 + 10 * self.known[self.key(question)]["seconds"] if changes else PATIENCE
+            begin = time.monotonic()
+            made = {"key": key, "question": question, "answer": self.run(question, changes, limit)}
+            self.known[key] = made | {"seconds": round(time.monotonic() - begin, 1)}
+            self.results.parent.mkdir(exist_ok=True)
+            with self.results.open("a") as file:
+                file.write(json.dumps(self.known[key]) + "\n")
+            self.asked += 1
+            say(f"{self.asked}: {question}, {len(changes)} changed, {self.known[key]['seconds']} s")
+        found: list[str] = self.known[key]["answer"]
+        return found
+
+    def key(self, question: str) -> str:
+        return hashlib.sha256(json.dumps([self.code, question, {}], sort_keys=True).encode()).hexdigest()
+
+    def run(self, question: str, changes: Changes, limit: float) -> list[str]:
+        paths = [str(golden.ROOT / part) for part in ("core", "plugins", "benchmarks")]
+        env = os.environ | golden.ONE | {"PYTHONPATH": os.pathsep.join(paths)}
+        command = [sys.executable, __file__, "--ask", question]
+        try:
+            done = subprocess.run(
+                command, cwd=golden.ROOT, env=env, input=json.dumps(changes), capture_output=True, text=True, timeout=limit
+            )
+        except subprocess.TimeoutExpired:
+            return [f"error: more than {limit:.0f} s"]
+        return json.loads(done.stdout) if done.returncode == 0 else [f"error: {done.stderr.splitlines()[-1:]}"]
+
+    def moved(self, question: str, changes: Changes) -> bool:
+        return self.answer(question, changes) != self.answer(question, {})
+
+    def culprits(self, question: str, changes: Changes, held: Changes) -> dict[str, Any]:
+        """Of changes that move an answer beside those that are held: single ones, or a few that do together."""
+        if len(changes) == 1:
+            return dict(changes)
+        keys = list(changes)
+        one, two = ({k: changes[k] for k in part} for part in (keys[: len(keys) // 2], keys[len(keys) // 2 :]))
+        for part in (one, two):
+            if self.moved(question, {**held, **part}):
+                return self.culprits(question, part, held)
+        first = self.culprits(question, one, {**held, **two})
+        return first | self.culprits(question, two, {**held, **first})
+
+    def decided(self, changes: dict[str, Any], found: dict[str, tuple[Any, str]]) -> None:
+        """Fills in `module:name` → (its changed value, question), and takes these out of the changes, until no answer moves."""
+        clean = False
+        while not clean:
+            clean = True
+            for question in self.questions:
+                while self.moved(question, changes):
+                    clean = False
+                    for key, value in self.culprits(question, changes, {}).items():
+                        found[key] = value, question
+                        del changes[key]
+                        say(f"{key} = {value} decides {question}")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="few questions, in at most ten minutes; it goes on where it ended")
+    parser.add_argument("--only", default="", metavar="ROOM", help="thresholds of rooms with this text in their names")
+    parser.add_argument("--specs", action="store_true", help="ask the published specs as well")
+    parser.add_argument("--seed", type=int, default=golden.SEED)
+    parser.add_argument("--results", type=Path, default=RESULTS, metavar="FILE", help="where answers are kept")
+    parser.add_argument("--ask", help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.ask:
+        print(json.dumps(ask(given.ask, json.load(sys.stdin))))
+        return 0
+    sys.path[:0] = [str(golden.ROOT / part) for part in ("core", "plugins")]
+    asked = [q for q in golden.questions(golden.ROOT) if given.specs or not q.endswith(".yaml")]
+    battery = Battery(
+        list(QUICK) if given.quick else asked, given.results, time.monotonic() + SECONDS if given.quick else np.inf
+    )
+    rows, ended = list[str](), True
+    ways = draws(given.seed, given.only)
+    cleared = set[str]()
+    for way, changes in enumerate(ways):
+        found: dict[str, tuple[Any, str]] = {}
+        try:
+            for question in battery.questions:
+                battery.answer(question, {})
+            battery.decided(changes, found)
+            cleared = cleared & changes.keys() if way else set(changes)
+        except TimeoutError:
+            ended, cleared = False, set()
+        now = tables()
+        for key, (value, question) in sorted(found.items()):
+            module, _, name = key.partition(":")
+            room = module.removesuffix(".thresholds")
+            rows.append(f"| {room} | `{name}` | {getattr(now[module], name)} | {value} | {question} |")
+    print(", ".join(f"{k}: {v}" for k, v in harness.machine().items()), "\n")
+    print("| room | threshold | is | changed to | moves the answer to |", "| --- | --- | --- | --- | --- |", *rows, sep="\n")
+    every = len(set().union(*draws(given.seed, given.only)))
+    state = (
+        f"{len(cleared)} of {every} thresholds change nothing, halved or doubled" if ended else "not all is asked: call again"
+    )
+    print(f"\n{len(battery.questions)} questions: {state}.")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

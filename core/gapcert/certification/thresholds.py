@@ -1,0 +1,46 @@
+"""Numbers that decide or bound what is tried, accepted or refused in this room, each with its reason."""
+
+from dataclasses import dataclass
+from typing import final
+
+from gapcert.thresholds import chosen, threshold
+
+
+@final
+@dataclass(frozen=True)
+class Thresholds:
+    """Read as `THRESHOLDS.name`."""
+
+    # the package itself
+    judged_points: int = chosen(25_000, "between two reports of progress")
+    same_period: float = chosen(1e-12, "relative: periods that were stated as one differ by rounding alone")
+    yardstick_samples: int = chosen(20_000, "from which on no envelope is made beside theorem 1, whose cost grows with them")
+    suspects: int = chosen(200, "samples above γ that are held against all others: one contradiction is enough")
+    constant_looks: float = chosen(4e8, "at samples, by the branch and bound behind a constant")
+    # bounds
+    trail_parts: int = chosen(4, "of a pair in each step: a jump's slope then grows by 4, a settled one by 1")
+    trail_clear: float = chosen(16.0, "resolutions: smaller changes tell nothing")
+    supremum_batch: int = chosen(2048, "boxes of a round: fewer go to the widest first, more cost less each")
+    supremum_probes: int = chosen(64, "boxes of a round whose centres are asked, for a lower end")
+    # gates
+    hidden_vertices: int = chosen(64, "of declared ranges, at most: beyond six numbers they are drawn")
+    hidden_move: float = chosen(0.1, "of a hidden number without a range, in rad, m, rad/s, …; 1 where it has no unit")
+    hidden_candidates: int = chosen(64, "drawn per state, for one that keeps the relations")
+    harmless: int = threshold(4, "resolutions: by the formula, both answers of a spread may err by e of f̂ and of f")
+    hidden_queries: int = chosen(384, "of a probe, shared by all hidden numbers")
+    hidden_together: int = chosen(48, "states at which all hidden numbers are moved at once")
+    hidden_runs: int = chosen(24, "rollouts, from which visited hidden states are taken")
+    hidden_steps: int = chosen(12, "of each of them")
+    spread_points: int = chosen(64, "at which the spread over hidden states is measured")
+    spread_draws: int = chosen(16, "hidden states at each of these")
+    purity_rows: int = chosen(64, "that are asked again in other orders and shapes")
+    held_periods: int = chosen(512, "at most, for which a system is left alone between two answers")
+    response_error: float = chosen(0.1, "relative, between what an input moves in f̂ and in f: a warning, no refusal")
+    response_rows: int = chosen(16, "states at which an input is moved from end to end")
+    # samples
+    spread_grid: int = chosen(300, "points of a grid where nobody asks for another")
+    refinement_rounds: int = chosen(8, "at most 9, since names of rounds are sorted as texts")
+    refinement_points: int = chosen(4_000, "at which the band is looked at, which costs no simulation")
+
+
+THRESHOLDS = Thresholds()

@@ -1,0 +1,24 @@
+"""Numbers that decide or bound what is tried, accepted or refused in this room, each with its reason."""
+
+from dataclasses import dataclass
+from typing import final
+
+from gapcert.thresholds import chosen
+
+
+@final
+@dataclass(frozen=True)
+class Thresholds:
+    """Read as `THRESHOLDS.name`."""
+
+    # data
+    relation_texts: int = chosen(8, "inequalities that one text may stand for: absolute values double them")
+    epoch: float = chosen(1e6, "s: later times count from some epoch, and are counted from their first instead")
+    # gaps
+    symmetry_pairs: int = chosen(500, "of points at which a declared symmetry is held against the residual")
+    # systems
+    region_sweeps: int = chosen(40, "of coordinates, for the extreme of an ellipsoid over a box")
+    ellipsoid_states: int = chosen(8, "at most: a cell has two to their number corners")
+
+
+THRESHOLDS = Thresholds()
