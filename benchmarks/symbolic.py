@@ -80,7 +80,6 @@ def problem(case: Case) -> tuple[Symbolic, gc.SynthesisProblem]:
     spec = gc.load_spec(SPECS / f"{case.spec}.yaml")
     model, made = spec.build("model"), spec.build("controller")
     model = Opaque(model) if case.opaque else model
-    made.growth = gc.load_spec(spec.folder / made.growth.model).build("model")
     domain = gc.Domain.of(model, dict(spec.config.domain), spec.config.relations)
     goal = spec.goal(domain)
     if case.eta is not None:

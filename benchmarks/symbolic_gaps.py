@@ -46,8 +46,6 @@ def synthesized(spec: gc.Spec, gap: gc.GapFunction) -> tuple[float, float, Any]:
     """CPU seconds of the gap over blocks, and of the whole, the better of two; and the controller's evidence."""
     model, made = spec.build("model"), spec.build("controller")
     made.threads = 1
-    if made.growth is not None:
-        made.growth = gc.load_spec(spec.folder / made.growth.model).build("model")
     domain = gc.Domain.of(model, dict(spec.config.domain))
     best, bounded, evidence = np.inf, 0.0, None
     for _ in range(2):

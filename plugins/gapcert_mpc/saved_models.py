@@ -66,8 +66,8 @@ def _known(name: str) -> bool:
 
 
 def _packages() -> set[str]:
-    found = (c.target for c in registry().components.values() if c.kind in ("gap_family", "route"))
-    return {"gapcert", "gapcert_functions", "gapcert_networks", *(target.partition(".")[0] for target in found)}
+    found = (c.target.partition(".")[0] for c in registry().components.values() if c.kind in ("gap_family", "route"))
+    return {"gapcert", "gapcert_cells", "gapcert_functions", "gapcert_networks", *found}
 
 
 def known(data: Any, arrays: Mapping[str, Array]) -> Mapping[str, Any]:

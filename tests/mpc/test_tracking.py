@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from gapcert_report.pictures.experiment import wanted_pictures
 
 from gapcert import UsageError, closed_loop
 from gapcert_cells.testing import Band, Rod, rod_problem, rod_reach_avoid
@@ -21,6 +20,7 @@ from gapcert_mpc.controller import MpcController
 from gapcert_mpc.planning.tracking import Course
 from gapcert_mpc.program.solver import Piqp
 from gapcert_mpc.synthesizer import Mpc
+from gapcert_report.pictures.loop import wanted_pictures
 
 Array = np.ndarray
 GAP = Band((-1.5e-4, -6e-5), (1.5e-4, 6e-5))

@@ -97,7 +97,6 @@ def test_a_predictor_shifts_boxes_once() -> None:
 def published() -> tuple[Symbolic, gc.SynthesisProblem, Bound, Grid, tuple[np.ndarray, ...]]:
     spec = gc.load_spec(VEHICLE)
     model, made = spec.build("model"), spec.build("controller")
-    made.growth = gc.load_spec(spec.folder / made.growth.model).build("model")
     domain = gc.Domain.of(model, dict(spec.config.domain))
     problem = gc.SynthesisProblem(model, None, domain, spec.goal(domain))
     plan = made._plan(model, domain, problem.goal, None)

@@ -20,7 +20,6 @@ SPECS = Path(__file__).parents[2] / "specs" / "benchmarks"
 def solved(name: str, gap: gc.GapFunction | None = None, **eta: float) -> gapcert_cells.GridController:
     spec = gc.load_spec(SPECS / f"{name}.yaml", overrides=[f"controller.eta.{k}={v}" for k, v in eta.items()])
     model, made = spec.build("model"), spec.build("controller")
-    made.growth = gc.load_spec(spec.folder / made.growth.model).build("model")
     domain = gc.Domain.of(model, dict(spec.config.domain))
     return made.synthesize(gc.SynthesisProblem(model, gap, domain, spec.goal(domain)))
 
