@@ -209,7 +209,7 @@ def lift(
             break
         order = np.argsort(goal[cell] - found.upper, kind="stable")
         first, rest = order[: THRESHOLDS.cut_boxes], order[THRESHOLDS.cut_boxes :]
-        halves = _cut(boxes[first], found.axis[first], found.cut[first])
+        halves = boxes[first].cut(found.axis[first], found.cut[first])
         own, which, parents = np.tile(cell[first], 2), np.tile(part[first], 2), np.tile(found.upper[first], 2)
         if zone.relations:
             keep = ~zone.outside(halves)
@@ -241,11 +241,3 @@ def _first(side: Side, table: Table, zone: Zone) -> tuple[Interval, Index, Index
         found.append((boxes[keep], rows[keep], np.full(int(keep.sum()), p)))
     boxes = Interval.concatenate([b for b, _, _ in found])
     return boxes, np.concatenate([c for _, c, _ in found]), np.concatenate([p for _, _, p in found])
-
-
-def _cut(boxes: Interval, axis: Index, at: Array) -> Interval:
-    """Each box cut in two; the lower halves come first."""
-    rows = np.arange(len(boxes))
-    low, high = boxes.lo.copy(), boxes.hi.copy()
-    low[rows, axis] = high[rows, axis] = np.clip(at, boxes.lo[rows, axis], boxes.hi[rows, axis])
-    return Interval.concatenate([Interval(boxes.lo, high), Interval(low, boxes.hi)])

@@ -44,16 +44,8 @@ def _exceeds(e: Evidence, part: Part, i: int, gamma: float, budget: int = 400_00
         if (at > gamma * (1 + 1e-12)).any():
             k = int(at.argmax())
             return f"state {i} at {boxes.mid[k].tolist()}: the envelope reaches {at[k]:.6g}, above γ = {gamma:.6g}"
-        boxes = _halves(boxes, weight)
+        boxes = boxes.cut((weight * (boxes.hi - boxes.lo)).argmax(axis=1))
         boxes = boxes[~e.zone.outside(boxes)]
-
-
-def _halves(boxes: Interval, weight: Array) -> Interval:
-    """Each box cut in two across its axis with the largest weight_j · width_j."""
-    axis, k = (weight * (boxes.hi - boxes.lo)).argmax(axis=1), np.arange(len(boxes))
-    low, high = boxes.lo.copy(), boxes.hi.copy()
-    low[k, axis] = high[k, axis] = boxes.mid[k, axis]
-    return Interval.concatenate([Interval(boxes.lo, high), Interval(low, boxes.hi)])
 
 
 def _band(e: Evidence, part: Part, i: int, boxes: Interval) -> tuple[Interval, Interval]:

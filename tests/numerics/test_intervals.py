@@ -186,6 +186,15 @@ def test_nan_constants_and_empty_intersections_are_refused():
         Interval(0.0, 1.0).intersect(Interval(2.0, 3.0))
 
 
+def test_boxes_are_cut_across_an_axis_of_each():
+    boxes = Interval(np.array([[0.0, 0.0], [1.0, 2.0]]), np.array([[4.0, 2.0], [3.0, 6.0]]))
+    parts = boxes.cut(np.array([0, 1]))
+    assert (parts.lo == [[0, 0], [1, 2], [2, 0], [1, 4]]).all()
+    assert (parts.hi == [[2, 2], [3, 4], [4, 2], [3, 6]]).all()
+    low, high = np.split(boxes.cut(np.array([0, 0]), np.array([1.0, 9.0])).hi[:, 0], 2)
+    assert (low.tolist(), high.tolist()) == ([1, 3], [4, 3])
+
+
 @pytest.mark.parametrize("name", BINARY)
 def test_rounding_inwards_would_be_caught(name, monkeypatch):
     """The outward step is necessary: without it some exact result lies outside."""

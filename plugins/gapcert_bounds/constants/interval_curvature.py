@@ -125,7 +125,7 @@ class _Search:
         best, rows = np.full(len(chosen), np.inf), np.arange(len(chosen))
         axis, values = np.zeros(len(chosen), dtype=np.intp), np.zeros((2, *bound.shape))
         for k in range(boxes.lo.shape[1]):
-            found = np.minimum(self._bend(halves(boxes, np.full(len(rows), k))).mag.reshape(2, *bound.shape), bound)
+            found = np.minimum(self._bend(boxes.cut(np.full(len(rows), k))).mag.reshape(2, *bound.shape), bound)
             left = np.divide(found, bound, out=np.ones_like(found), where=np.isfinite(bound) & (bound > 0))
             left = np.where(np.isinf(bound) & np.isfinite(found), 0.0, left)
             cost = np.round((left.mean(axis=0) * loose).sum(axis=1), 9) - 1e-9 * (boxes.width / self.width)[:, k]
@@ -135,11 +135,4 @@ class _Search:
                 np.where(better, k, axis),
                 np.where(better[:, None], found, values),
             )
-        return halves(boxes, axis), values.reshape(-1, bound.shape[1])
-
-
-def halves(boxes: Interval, axis: Index) -> Interval:
-    """The lower halves of boxes along an axis of each, then the upper ones."""
-    low, high, rows = boxes.lo.copy(), boxes.hi.copy(), np.arange(len(boxes))
-    low[rows, axis] = high[rows, axis] = boxes.mid[rows, axis]
-    return Interval.concatenate([Interval(boxes.lo, high), Interval(low, boxes.hi)])
+        return boxes.cut(axis), values.reshape(-1, bound.shape[1])

@@ -15,7 +15,7 @@ from gapcert.plugin import LipschitzBound, LipschitzEstimator, LipschitzProblem,
 from gapcert_bounds.thresholds import THRESHOLDS
 
 from .interval_cells import Slopes, cells
-from .interval_curvature import halves, proved
+from .interval_curvature import proved
 
 Bend = float | Sequence[Sequence[float]]
 T = TypeVar("T")
@@ -138,8 +138,8 @@ class IntervalJacobian(LipschitzEstimator):
             count = min(self.boxes - len(boxes), max(1, len(boxes) // 2))
             order = np.argsort(-urgency, kind="stable")
             first, rest = order[:count], order[count:]
-            cut = boxes[first]
-            parts = halves(cut, ((cut.hi - cut.lo) / problem.domain.width).argmax(axis=1))
+            urgent = boxes[first]
+            parts = urgent.cut(((urgent.hi - urgent.lo) / problem.domain.width).argmax(axis=1))
             tighter = np.minimum(_slopes(fhat, problem, parts).mag, np.tile(bound[first], (2, 1, 1)))
             lower = np.maximum(lower, _reached(fhat, problem, parts))
             boxes, bound = Interval.concatenate([boxes[rest], parts]), np.concatenate([bound[rest], tighter])

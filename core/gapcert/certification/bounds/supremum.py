@@ -90,7 +90,8 @@ def _supremum(
             return max(settled, bound.max(initial=0.0)), lower
         order = np.argsort(-bound, kind="stable")
         first, rest = order[: THRESHOLDS.supremum_batch], order[THRESHOLDS.supremum_batch :]
-        halves, parents = split(boxes[first], gap.lipschitz(boxes[first])[:, i]), np.tile(bound[first], 2)
+        loose, parents = boxes[first], np.tile(bound[first], 2)
+        halves = loose.cut((gap.lipschitz(loose)[:, i] * (loose.hi - loose.lo)).argmax(axis=1))
         spent += len(halves)
         seen.add(len(halves), i, max(settled, float(bound[first[0]])), lower)
         if domain.relations:
@@ -100,15 +101,6 @@ def _supremum(
         tighter = np.minimum(gap.gamma_of(halves, i), parents)
         lower = max(lower, _reached(gap, domain, halves[np.argsort(-tighter)[: THRESHOLDS.supremum_probes]], i))
         boxes, bound = Interval.concatenate([boxes[rest], halves]), np.concatenate([bound[rest], tighter])
-
-
-def split(boxes: Interval, weight: Array) -> Interval:
-    """Each box cut in two across the axis with the largest weight_j · width_j; weight (n, nz); the lower halves come first."""
-    axis = (weight * (boxes.hi - boxes.lo)).argmax(axis=1)
-    rows = np.arange(len(boxes))
-    low, high = boxes.lo.copy(), boxes.hi.copy()
-    low[rows, axis] = high[rows, axis] = boxes.mid[rows, axis]
-    return Interval.concatenate([Interval(boxes.lo, high), Interval(low, boxes.hi)])
 
 
 def _reached(gap: GapFunction, domain: Domain, boxes: Interval, i: int) -> float:
