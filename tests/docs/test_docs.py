@@ -113,3 +113,13 @@ def test_old_names_answer_and_say_where_they_are_now():
 
 def test_every_kind_is_explained():
     assert [kind for kind in KINDS if f"`{kind}`" not in text("plugins.md")] == []
+
+
+def test_the_readme_has_as_many_effects_and_the_families_that_there_are():
+    page, registry = (ROOT / "README.md").read_text(), gapcert.registry()
+    own = {
+        kind: {c.name for c in registry.of(kind) if c.distribution.startswith("gapcert ")} for kind in ("effect", "gap_family")
+    }
+    assert re.findall(r"\[(\d+) effects\]", page) == [str(len(own["effect"]))]
+    (families,) = re.findall(r"^\| gap families \| (.*?):", page, re.MULTILINE)
+    assert set(re.findall(r"`(\S+?)`", families)) == own["gap_family"]

@@ -67,6 +67,27 @@ def test_a_command_is_there_with_its_arguments(with_components, capsys):
     assert "greet somebody" in capsys.readouterr().out
 
 
+@pytest.mark.run
+def test_a_study_after_a_certificate_adds_to_its_summary(with_components, tmp_path):
+    with_components(*knocking.components())
+    spec = {**CERTIFIED, "along": {}, "expect": {"along.largest <=": 0.1, "certificate.claim.kind": "empirical"}}
+    done = gc.run(spec, out=tmp_path)
+    assert done.exit_code == 0
+    assert 0 < json.loads((done.folder / "summary.json").read_text())["along"]["largest"] < 0.1
+    with pytest.raises(gc.SpecError, match=r"along: 'along' needs 'certificate'"):
+        gc.load_spec({**PLAIN, "along": {}})
+
+
+@pytest.mark.unit
+def test_those_of_others_are_listed(with_components, capsys):
+    with_components(*knocking.components())
+    assert main(["plugins", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    found = {(r["kind"], r["name"]) for r in rows if not r["distribution"] and r["available"]}
+    assert found == {("study", "knock"), ("study", "along"), ("section", "note"), ("command", "hello")}
+    assert ("study", "diagnose") not in {(r["kind"], r["name"]) for r in rows}
+
+
 @pytest.mark.unit
 def test_commands_that_cannot_be_are_told_and_left_out(with_components, capsys):
     with_components(*knocking.components(), *knocking.wrong())

@@ -528,6 +528,12 @@ class TestBounds(PluginContract):
     plugin = "gapcert_bounds.plugin"
 
 
+class TestDiagnosis(PluginContract):
+    """A study, a section, commands."""
+
+    plugin = "gapcert_diagnosis.plugin"
+
+
 HONEST = """
 import gapcert
 @gapcert.hookimpl
@@ -559,13 +565,33 @@ FAULTS = {
 }
 
 
-def declared(monkeypatch, tmp_path, name, file="", old="", new=""):
+STUDY = (
+    HONEST.replace('"backend"', '"study"').replace('"a toy"', '"a study"'),
+    """
+from gapcert.plugin import Outcome, Section, SpecSection, Study
+class Toy(Study):
+    def run(self, build, folder, stages, made):
+        return Outcome({})
+class Asked(Section):
+    times: int = 1
+class Options(SpecSection):
+    model = Asked
+    about = "how often"
+""",
+)
+STUDY_FAULTS = {
+    "test_unknown_options_are_refused": ("parts", "times: int = 1", "model_config = {'extra': 'ignore'}"),
+    "test_options_are_frozen": ("parts", "times: int = 1", "model_config = {'frozen': False}"),
+}
+
+
+def declared(monkeypatch, tmp_path, name, file="", old="", new="", honest=(HONEST, PARTS)):
     """A plugin on the path with one text replaced, and a contract that finds it installed."""
     import importlib.metadata
 
     from gapcert.contracts.plugins.registry import discover
 
-    texts = {"plugin": HONEST.replace("{name}", name), "parts": PARTS}
+    texts = {"plugin": honest[0].replace("{name}", name), "parts": honest[1]}
     if file:
         assert old in texts[file]
         texts[file] = texts[file].replace(old, new)
@@ -580,7 +606,7 @@ def declared(monkeypatch, tmp_path, name, file="", old="", new=""):
         plugin = name
 
         def _registry(self):
-            return discover([point] if file or name == "honest" else [])
+            return discover([point] if file or name.startswith("honest") else [])
 
     return Checks()
 
@@ -601,3 +627,12 @@ def test_a_faulty_declaration_is_caught(check, monkeypatch, tmp_path):
     contract = declared(monkeypatch, tmp_path, f"planted_{list(FAULTS).index(check)}", *FAULTS[check])
     with pytest.raises(AssertionError):
         getattr(contract, check)()
+
+
+@pytest.mark.contract
+@pytest.mark.parametrize("check", STUDY_FAULTS)
+def test_the_options_of_a_study_are_those_of_its_section(check, monkeypatch, tmp_path):
+    getattr(declared(monkeypatch, tmp_path, "honest_study", honest=STUDY), check)()
+    name = f"planted_study_{list(STUDY_FAULTS).index(check)}"
+    with pytest.raises(AssertionError):
+        getattr(declared(monkeypatch, tmp_path, name, *STUDY_FAULTS[check], honest=STUDY), check)()

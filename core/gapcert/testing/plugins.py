@@ -10,8 +10,9 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from gapcert.contracts.plugins.component import Component, load
+from gapcert.contracts.plugins.component import KINDS, Component, load
 from gapcert.contracts.plugins.registry import Registry, installed
+from gapcert.spec.sections.plugin_sections import SpecSection
 from gapcert.testing.checks import expect
 
 _LISTING = """
@@ -72,6 +73,8 @@ class PluginContract(ABC):
 
     def test_options_name_their_kind(self) -> None:
         for c, config in self._configs():
+            if c.kind not in KINDS:
+                continue  # a section of its own, by its name
             kind = config.model_fields.get("kind")
             schema = config.model_json_schema().get("properties", {}).get("kind", {})
             expect(kind is not None and schema.get("const") == c.name, f'{c.config}: expected kind: Literal["{c.name}"]')
@@ -84,17 +87,23 @@ class PluginContract(ABC):
             except ValidationError as error:
                 if any(e["type"] == "extra_forbidden" for e in error.errors()):
                     continue
-            raise AssertionError(f'{c.config} takes unknown options; expected model_config = ConfigDict(extra="forbid")')
+            raise AssertionError(f'{_named(c)} takes unknown options; expected model_config = ConfigDict(extra="forbid")')
 
     def test_options_are_frozen(self) -> None:
         for c, config in self._configs():
-            expect(bool(config.model_config.get("frozen")), f"{c.config} can be changed; expected ConfigDict(frozen=True)")
+            expect(bool(config.model_config.get("frozen")), f"{_named(c)} can be changed; expected ConfigDict(frozen=True)")
 
     def _declared(self) -> list[Component]:
         return list(load(f"{self.plugin}:gapcert_components")())
 
     def _configs(self) -> list[tuple[Component, type[BaseModel]]]:
-        return [(c, load(c.config)) for c in self._declared() if c.config]
+        found = [(c, load(where)) for c in self._declared() if (where := _named(c))]
+        return [(c, what.model if issubclass(what, SpecSection) else what) for c, what in found]
 
     def _registry(self) -> Registry:
         return installed()
+
+
+def _named(c: Component) -> str:
+    """Where the options of a component stand: in its `config`; a section is itself what has them."""
+    return c.target if c.kind == "section" else c.config

@@ -23,11 +23,11 @@ SiteKind = Literal["coordinate", "input", "output", "parameter", "contact"]
 class EffectParameter:
     """One number of an effect, in powers of what a site is measured in.
 
-    `dimension` maps force, velocity, position, input, output (the root mean square at the site), the same with `_peak` or
-    `_range`, time, angle, mass and value (of a parameter) to exponents (empty: a pure number). It gives the unit at a site and,
-    from the data there, the scale; `starts`, `low` and `high` are multiples of that scale (of 1 s, 1 rad and 1 for times,
-    angles and pure numbers). At `off`, in its unit, the effect does nothing; it may lie beyond the bounds. plausible: values
-    in the same multiples outside which a fit is flagged. step: of differences, in the same multiples; 0: from the starts.
+    `dimension` maps force, velocity, position, input, output (the root mean square at the site), the same with `_peak`,
+    position_range, time, angle, mass and value (of a parameter) to exponents (empty: a pure number). It gives the unit at a
+    site and, from the data there, the scale; `starts`, `low` and `high` are multiples of that scale (of 1 s, 1 rad and 1 for
+    times, angles and pure numbers). At `off`, in its unit, the effect does nothing; it may lie beyond the bounds. plausible:
+    values in the same multiples outside which a fit is flagged. step: of differences, likewise; 0: from the starts.
     """
 
     name: str

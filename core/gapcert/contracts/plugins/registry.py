@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from gapcert.contracts.plugins.events import Emit, Event
 
 GROUP = "gapcert"
+_OWN = f"gapcert {__version__}"
 
 
 @final
@@ -59,11 +60,14 @@ class Registry:
         return self
 
     def listing(self) -> list[dict[str, Any]]:
-        """What there is, whether it can be loaded and why not; plugins that could not be imported stand last."""
+        """What there is, whether it can be loaded and why not; plugins that could not be imported stand last.
+
+        Kinds that are no `kind:` of a spec are there where others than Gapcert offer them.
+        """
         reasons = dict(zip(sorted(self.rivals), self.collisions(), strict=True))
         declared = [*self.components.values(), *(c for same in self.rivals.values() for c in same)]
         declared.sort(key=lambda c: (c.kind, c.name, c.distribution))
-        told = (c for c in declared if c.kind not in INNER)
+        told = (c for c in declared if c.kind not in INNER or c.distribution != _OWN)
         parts = [(c.kind, c.name, c.distribution, reasons.get((c.kind, c.name)) or c.missing()) for c in told]
         lost = [("plugin", b.entry_point, b.distribution, b.reason) for b in self.broken]
         keys = ("kind", "name", "distribution", "available", "reason")
@@ -142,8 +146,7 @@ def discover(entry_points: Iterable[importlib.metadata.EntryPoint]) -> Registry:
 
     manager = pluggy.PluginManager("gapcert")
     manager.add_hookspecs(hooks)
-    own = f"gapcert {__version__}"
-    components, broken = [replace(c, distribution=own) for c in BUILTIN], []
+    components, broken = [replace(c, distribution=_OWN) for c in BUILTIN], []
     for point in sorted(entry_points, key=lambda p: (_owner(p), p.name)):
         try:
             module = point.load()
