@@ -298,7 +298,7 @@ class Interval:
         return Interval._of(np.concatenate([p.lo for p in lifted], axis), np.concatenate([p.hi for p in lifted], axis))
 
     def cut(self, axis: npt.NDArray[np.intp], at: Array | None = None) -> Interval:
-        """Boxes (n, d), each cut across an axis (n,) at its middle, or as near to `at` (n,) as may be; lower parts come first."""
+        """Boxes (n, d), each cut across an axis (n,) at its middle, or as near to `at` (n,) as may be; lower parts first."""
         rows, low, high = np.arange(len(self)), self.lo.copy(), self.hi.copy()
         where = self.mid[rows, axis] if at is None else np.clip(at, low[rows, axis], high[rows, axis])
         low[rows, axis] = high[rows, axis] = where
