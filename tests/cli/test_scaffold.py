@@ -15,7 +15,7 @@ import pytest
 
 import gapcert.testing
 from gapcert.cli.main import main
-from gapcert.cli.scaffold.scaffold import scaffold
+from gapcert.cli.scaffold.scaffold import OFFERED, scaffold
 from gapcert.contracts.plugins.component import KINDS
 
 ROOT = Path(__file__).parents[2]
@@ -41,7 +41,7 @@ def done(*arguments, **options):
 # --- what is written
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", OFFERED)
 def test_files_of_a_plugin(kind, tmp_path):
     folder = tmp_path / "mine"
     assert new(kind, "my-part", "--out", folder) == 0
@@ -72,7 +72,7 @@ def test_files_of_a_plugin(kind, tmp_path):
 
 
 def test_plugins_import_gapcert_and_nothing_deeper():
-    for kind in KINDS:
+    for kind in OFFERED:
         for name, text in scaffold(kind, SHORT).texts.items():
             if name.startswith("gapcert_"):
                 assert not re.search(r"^(?:from|import) gapcert\.", text, re.M), name
@@ -93,10 +93,10 @@ def test_the_readme_names_methods_that_the_contract_has(kind):
 @pytest.mark.exam
 @pytest.mark.parametrize("name", [SHORT, LONG])
 def test_what_is_written_is_clean(name, tmp_path):
-    for kind in KINDS:
+    for kind in OFFERED:
         scaffold(kind, name).write(tmp_path / kind)
     for check in (["check"], ["format", "--check"]):
-        for kind in KINDS:
+        for kind in OFFERED:
             done("ruff", *check, "--no-cache", ".", cwd=tmp_path / kind)
 
 
@@ -118,7 +118,7 @@ def test_other_physics_is_another_digest(kind, tmp_path):
     ("kind", "name", "reason"),
     [
         ("engine", "my-robot", "'engine' is no kind of component; expected one of model, backend"),
-        ("controller", "my-robot", "executor, observer; did you mean 'synthesizer'?"),
+        ("controller", "my-robot", "observer, study; did you mean 'synthesizer'?"),
         ("effekt", "my-robot", "did you mean 'effect'?"),
         ("backend", "My_Robot", "did you mean 'my-robot'?"),
         ("backend", "../escape", "did you mean 'escape'?"),
@@ -130,6 +130,9 @@ def test_other_physics_is_another_digest(kind, tmp_path):
         ("backend", "mujoco", "backend 'mujoco' is there already, in gapcert "),
         ("backend", "equations", "model 'equations' is there already"),
         ("gap_family", "envelope", "gapcert_bounds.families.envelope:Envelope"),
+        ("study", "diagnose", "study 'diagnose' is there already, in gapcert "),
+        ("study", "play", "section 'play' is there already"),
+        ("study", "domain", "section 'domain' is Gapcert's own"),
         ("reader", "bounds", "there is a package gapcert_bounds"),
     ],
 )
@@ -186,7 +189,7 @@ def test_the_answer_as_data_and_in_words(tmp_path, monkeypatch, capsys):
 
 def test_help_names_every_kind(capsys):
     assert new("--help") == 0
-    assert set(KINDS) <= set(re.findall(r"\w+", capsys.readouterr().out))
+    assert set(OFFERED) <= set(re.findall(r"\w+", capsys.readouterr().out))
 
 
 def test_listing_is_what_it_was(capsys):
@@ -201,17 +204,17 @@ def test_listing_is_what_it_was(capsys):
 def distributions(tmp_path_factory):
     """One of every kind, and the folder that all of them are installed in, beside this environment."""
     folder, site = tmp_path_factory.mktemp("new"), tmp_path_factory.mktemp("site")
-    for kind in KINDS:
+    for kind in OFFERED:
         scaffold(kind, f"my-{kind.replace('_', '-')}").write(folder / kind)
     quiet = ("--quiet", "--no-deps", "--no-build-isolation", "--no-index", "--disable-pip-version-check")
-    done("pip", "install", *quiet, "--target", site, *(folder / kind for kind in KINDS))
+    done("pip", "install", *quiet, "--target", site, *(folder / kind for kind in OFFERED))
     return folder, site
 
 
 @pytest.mark.exam
 def test_every_kind_keeps_its_contract_and_its_example_runs(distributions):
     folder, site = distributions
-    tests = [folder / kind / "tests" for kind in KINDS]
+    tests = [folder / kind / "tests" for kind in OFFERED]
     options = ("-q", "-W", "error", "--import-mode=importlib", "-p", "no:cacheprovider", f"--rootdir={folder}")
     out = done("pytest", *options, *tests, path=[site], cwd=folder)
     assert int(re.search(r"(\d+) passed", out)[1]) > 20 * len(KINDS)
@@ -229,12 +232,12 @@ for spec in sys.argv[1:]:
 def test_every_kind_is_listed_and_its_example_is_valid(distributions):
     folder, site = distributions
     rows = {(r["kind"], r["name"]): r for r in json.loads(done("gapcert", "plugins", "--json", path=[site]))}
-    for kind in KINDS:
+    for kind in OFFERED:
         name = f"my-{kind.replace('_', '-')}"
         assert rows[kind, name]["available"] is True
         assert rows[kind, name]["distribution"] == f"gapcert-{name} 0.1.0"
     (folder / "validate_all.py").write_text(VALIDATE)
-    done("validate_all", *(folder / kind / "example.yaml" for kind in KINDS), path=[site, folder])
+    done("validate_all", *(folder / kind / "example.yaml" for kind in OFFERED), path=[site, folder])
     again = run("gapcert", "plugins", "new", "backend", "my-backend", path=[site], cwd=folder)
     assert again.returncode == 2
     assert "in gapcert-my-backend 0.1.0 (gapcert_my_backend.backend:MyBackendBackend)" in again.stderr
@@ -256,7 +259,7 @@ def test_a_period_may_have_a_unit(kind, tmp_path, monkeypatch):
 @pytest.mark.exam
 def test_every_kind_is_typed(distributions):
     folder, site = distributions
-    files = [*(site / f"gapcert_my_{kind}" for kind in KINDS), *(folder / kind / "tests" for kind in KINDS)]
+    files = [*(site / f"gapcert_my_{kind}" for kind in OFFERED), *(folder / kind / "tests" for kind in OFFERED)]
     # What is known of Gapcert and of the libraries is kept between runs.
     kept = f"--cache-dir={ROOT / '.mypy_cache' / 'scaffold'}"
     options = ("--strict", kept, "--explicit-package-bases", "--follow-imports=silent")
@@ -275,13 +278,14 @@ FAULTS = {
     "reader": ("reader.py", "float(word) for word", "abs(float(word)) for word", "numbers_come_back"),
     "executor": ("executor.py", "self.workers = workers", 'self.workers = "all"', "says_how_many_work"),
     "observer": ("observer.py", "print(text, file=file)", "print(text)", "leaves_standard_output_alone"),
+    "study": ("config.py", "    points:", '    model_config = {"frozen": False}\n    points:', "options_are_frozen"),
     "synthesizer": ("synthesizer.py", "problem.gap.interval_over(z)", "0.0", "gap_shrinks_the_domain"),
 }
 
 
 @pytest.mark.exam
 def test_planted_faults_fail_the_contracts(tmp_path):
-    assert set(FAULTS) == set(KINDS)
+    assert set(FAULTS) == set(OFFERED)
     for kind, (file, old, fault, _) in FAULTS.items():
         made = scaffold(kind, f"faulty-{kind.replace('_', '-')}")
         path = f"{made.package}/{file}"
@@ -290,7 +294,7 @@ def test_planted_faults_fail_the_contracts(tmp_path):
         (tmp_path / kind / path).write_text(made.texts[path].replace(old, fault))
     options = ("-q", "-p", "no:cacheprovider", "--import-mode=importlib", f"--rootdir={tmp_path}", "--tb=no", "-rfE")
     chosen = " or ".join(check for *_, check in FAULTS.values())
-    tests, path = [tmp_path / kind / "tests" for kind in KINDS], [tmp_path / kind for kind in KINDS]
+    tests, path = [tmp_path / kind / "tests" for kind in OFFERED], [tmp_path / kind for kind in OFFERED]
     result = run("pytest", *options, "-k", chosen, *tests, path=path, cwd=tmp_path)
     failed = [line for line in result.stdout.splitlines() if line.startswith("FAILED ")]
     for kind, (*_, check) in FAULTS.items():

@@ -13,7 +13,7 @@ from gapcert.contracts.plugins.command import EXECUTED, SET, SPEC, Answer, Argum
 from gapcert.contracts.plugins.component import Component
 from gapcert.numerics.errors import UsageError
 
-_KINDS = "model, backend, gap_family, lipschitz, synthesizer, effect, reader, executor or observer"
+_KINDS = "model, backend, gap_family, lipschitz, synthesizer, effect, reader, executor, observer or study"
 
 
 def _command(name: str, summary: str, *arguments: Argument, does: str = "") -> Component:

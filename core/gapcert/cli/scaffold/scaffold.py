@@ -19,10 +19,10 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import final
 
-from gapcert.contracts.plugins.component import KINDS
 from gapcert.contracts.plugins.registry import installed
 from gapcert.numerics.errors import UsageError
 from gapcert.spec.check import COMPONENTS
+from gapcert.spec.editors.offers import SECTIONS
 
 _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 _LONGEST = 30  # characters of a name; chosen, not measured
@@ -49,7 +49,9 @@ _TEMPLATES = {
     "reader": _Template("reader", "@Camel@Reader", "columns of numbers under a header with units"),
     "executor": _Template("executor", "make", "worker processes of low priority", ("gapcert",)),
     "observer": _Template("observer", "@Camel@Observer", "a line per stage, in the folder of the run", ("gapcert",)),
+    "study": _Template("study", "@Camel@Study", "the largest gap that is allowed for, at points of the domain"),
 }
+OFFERED = tuple(_TEMPLATES)
 
 
 @final
@@ -86,10 +88,10 @@ class Scaffold:
 
 def scaffold(kind: str, name: str) -> Scaffold:
     """A new component of a kind; UsageError where either name cannot be used, or somebody has it."""
-    if kind not in KINDS:
-        near = [*COMPONENTS.get(kind, ()), *difflib.get_close_matches(kind, KINDS, 1)]
+    if kind not in OFFERED:
+        near = [*COMPONENTS.get(kind, ()), *difflib.get_close_matches(kind, OFFERED, 1)]
         meant = f"; did you mean '{near[0]}'?" if near else ""
-        raise UsageError(f"plugins new: '{kind}' is no kind of component; expected one of {', '.join(KINDS)}{meant}")
+        raise UsageError(f"plugins new: '{kind}' is no kind of component; expected one of {', '.join(OFFERED)}{meant}")
     _usable(kind, name)
     snake = name.replace("-", "_")
     camel = "".join(part.capitalize() for part in name.split("-"))
@@ -128,8 +130,13 @@ def _usable(kind: str, name: str) -> None:
 
 
 def _free(kind: str, name: str, distribution: str, package: str) -> None:
-    """A section of a spec takes components of one kind, or models and backends: names are looked for in all of these."""
-    rivals = ("model", "backend") if kind in ("model", "backend") else (kind,)
+    """A section of a spec takes components of one kind, or models and backends: names are looked for in all of these.
+    A study is a section.
+    """
+    shared = (("model", "backend"), ("study", "section"))
+    rivals = next((kinds for kinds in shared if kind in kinds), (kind,))
+    if kind == "study" and name in SECTIONS:
+        raise UsageError(f"plugins new: section '{name}' is Gapcert's own; choose another name")
     for c in (*installed().components.values(), *(c for same in installed().rivals.values() for c in same)):
         if c.name == name and c.kind in rivals:
             whose = f"{c.distribution} ({c.target})"
