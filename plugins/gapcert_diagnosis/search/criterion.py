@@ -3,21 +3,20 @@
 ΔS is the fall of the score from the old fit to the new one (`better`), z the agreement of windows (`agreement`), χ the mean
 squared residual of a channel over that of noise, G the charge for one more cause, 12 + 2 ln(candidates).
 
-| test           | compares                         | holds where                                   | asked by       |
-| -------------- | -------------------------------- | --------------------------------------------- | -------------- |
+| test           | compares                         | holds where                                           | asked by       |
+| -------------- | -------------------------------- | ----------------------------------------------------- | -------------- |
 | `noise`        | a fit, the noise floor           | χ ≤ max(`noise_level`, 1 + chance) in all channels    | everyone       |
-| `pays`         | a set, one without some causes   | χ falls, ΔS > G; z > `sure_errors` if it falls little  | steps, drops   |
-| `decides`      | a set, one without one cause     | χ > PLAIN² without it, most of that gone      | `matters`      |
-| `outdoes`      | a set, one on another path       | ΔS > 0; if it is larger ΔS > G, and it pays   | steps          |
+| `pays`         | a set, one without some causes   | χ falls, ΔS > G; z > `sure_errors` if it falls little | steps, drops   |
+| `decides`      | a set, one without one cause     | χ > `plain_residual`² without it, most of that gone   | `matters`      |
+| `outdoes`      | a set, one on another path       | ΔS > 0; if it is larger ΔS > G, and it pays           | steps          |
 | `beats`        | two causes at once, single steps | ΔS > `tie_score`; ΔS > 0 if they are fewer            | pairs          |
 | `margin`       | a set, one with another law      | ΔS > ±`richer` by its numbers; as many: ±`tie_score`  | exchanges      |
 | `richer`       | a law, one that it contains      | ΔS > `richer_score`                                   | ties, `margin` |
 | `agrees`       | two fits, on later data          | these see `guard_share` of the excess over noise gone | later data     |
-| `fails`        | a fit on later data, its due     | χ > `late_residual` times what is due                    | later data
-| | `setting_pays` | a fit under another setting      | χ falls by `setting_share`, ΔS > charge                  | settings
- |
+| `fails`        | a fit on later data, its due     | χ > `late_residual` times what is due                 | later data     |
+| `setting_pays` | a fit under another setting      | χ falls by `setting_share`, ΔS > charge               | settings       |
 
-Where a search is cautious and the closer of two fits is rough, ΔS is at most z², `rough_charge` stands for G, and SURE² or
+Where a search is cautious and the closer of two fits is rough, ΔS is at most z², `rough_charge` stands for G, and `sure_errors`² or
 `spared_score` for `richer_score`. `effect_size` says which causes are too small to be named, `native.stepwise` what pays for an
 engine.
 """
