@@ -19,7 +19,6 @@ import numpy as np
 
 import gapcert as gc
 from gapcert_bounds.testing.fields import Waves, gap_problem
-from gapcert_functions import majorant_of
 
 SPEC = Path(__file__).resolve().parent.parent / "specs" / "pendulum.yaml"
 ALONE = (
@@ -62,7 +61,7 @@ def rows(case: str, gap: gc.GapFunction, box: gc.Interval, count: int) -> list[h
     z, zero = box.lo + np.random.default_rng(0).random((100_000, box.shape[1])) * box.width, np.zeros(box.shape[1])
     for name, bound in (("γ", gap.gamma_over), ("remainder", lambda b: gap.remainder_over(b).mag)):
         begin = time.process_time()
-        c, a = majorant_of(bound, box.lo[0], box.hi[0], zero, count)
+        c, a = gc.plugin.majorant_of(bound, box.lo[0], box.hi[0], zero, count)
         took, mean, flat = time.process_time() - begin, (c + np.abs(z) @ a.T).mean(axis=0), bound(box)[0]
         text = f"mean majorant of {name}, {count} cells in {took:.1f} s, state"
         found += [harness.row(case, f"{text} {i}", "unit of the state", mean[i], flat[i], "constant") for i in range(len(mean))]

@@ -51,8 +51,8 @@ _MOVED = homes(
         "gapcert.plugin": (
             "AffinePredictor Automaton Bools Cells Cover Effect EffectParameter Extension GapFamily GapProblem "
             "Ints LipschitzBound LipschitzEstimator LipschitzProblem Memory ModelPredictor Points "
-            "Policy Predictor Pulse Reader Relation Residual Samples Scene Shape Step Synthesizer Trails compiler "
-            "difference follow identity located magnitude supremum"
+            "Policy Predictor Pulse Reader Relation Residual Samples Scene Shape Step Synthesizer Trails cells_of compiler "
+            "difference follow identity located magnitude majorant majorant_of supremum"
         ),
         "gapcert_bounds": "MultilinearPredictor",
         "gapcert_cells": (
@@ -68,8 +68,7 @@ _MOVED = homes(
             "RecordedFigure Runs WinningFigure"
         ),
         "gapcert_functions": (
-            "DominatingGap Expression Factor Function Table Term WeightedSum band cells_of dominate majorant majorant_of "
-            "mean_value weighted"
+            "DominatingGap Expression Factor Function Table Term WeightedSum band dominate mean_value weighted"
         ),
         "gapcert_networks": "LocalBound Network NetworkBound NetworkCertifier Proposal local_bound raised",
     }

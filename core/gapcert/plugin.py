@@ -62,6 +62,7 @@ _HOME = homes(
         "gapcert.numerics.interpolation": "cells cut highest interpolate joined on_curvature ranges rounding slopes worst",
         "gapcert.numerics.intervals": "Interval",
         "gapcert.numerics.kernels": "compiler",
+        "gapcert.numerics.majorant": "cells_of majorant majorant_of",
         "gapcert.numerics.order_statistics": "missed",
         "gapcert.numerics.texts": "columns leaves times",
         "gapcert.run.build": "Build",
@@ -79,7 +80,7 @@ _HOME = homes(
         "gapcert.testing.checks": "expect",
         "gapcert.testing.signals": "multisine",
         "gapcert.testing.toys": "PLAIN",
-        "gapcert.numerics.thresholds": "chosen decides reasons threshold",
+        "gapcert.thresholds": "chosen decides reasons threshold",
         "gapcert.version": "__version__",
     }
 )

@@ -166,14 +166,13 @@ from gapcert.numerics.interpolation import slopes as slopes
 from gapcert.numerics.interpolation import worst as worst
 from gapcert.numerics.intervals import Interval as Interval
 from gapcert.numerics.kernels import compiler as compiler
+from gapcert.numerics.majorant import cells_of as cells_of
+from gapcert.numerics.majorant import majorant as majorant
+from gapcert.numerics.majorant import majorant_of as majorant_of
 from gapcert.numerics.order_statistics import missed as missed
 from gapcert.numerics.texts import columns as columns
 from gapcert.numerics.texts import leaves as leaves
 from gapcert.numerics.texts import times as times
-from gapcert.numerics.thresholds import chosen as chosen
-from gapcert.numerics.thresholds import decides as decides
-from gapcert.numerics.thresholds import reasons as reasons
-from gapcert.numerics.thresholds import threshold as threshold
 from gapcert.run.build import Build as Build
 from gapcert.run.study import Outcome as Outcome
 from gapcert.run.study import Study as Study
@@ -208,4 +207,8 @@ from gapcert.spec.text.source import read as read
 from gapcert.testing.checks import expect as expect
 from gapcert.testing.signals import multisine as multisine
 from gapcert.testing.toys import PLAIN as PLAIN
+from gapcert.thresholds import chosen as chosen
+from gapcert.thresholds import decides as decides
+from gapcert.thresholds import reasons as reasons
+from gapcert.thresholds import threshold as threshold
 from gapcert.version import __version__ as __version__

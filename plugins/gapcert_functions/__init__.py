@@ -12,7 +12,6 @@ _HOME = homes(
         "gapcert_functions.dominating": "DominatingGap band dominate",
         "gapcert_functions.expression": "Expression",
         "gapcert_functions.lifting": "Cones Part Side Table lift",
-        "gapcert_functions.majorant": "cells_of majorant majorant_of majorant_over",
         "gapcert_functions.multilinear_bands": "Band",
         "gapcert_functions.products": "Factor Term",
         "gapcert_functions.sums": "WeightedSum weighted",

@@ -10,10 +10,6 @@ from gapcert_functions.lifting import Part as Part
 from gapcert_functions.lifting import Side as Side
 from gapcert_functions.lifting import Table as Table
 from gapcert_functions.lifting import lift as lift
-from gapcert_functions.majorant import cells_of as cells_of
-from gapcert_functions.majorant import majorant as majorant
-from gapcert_functions.majorant import majorant_of as majorant_of
-from gapcert_functions.majorant import majorant_over as majorant_over
 from gapcert_functions.multilinear_bands import Band as Band
 from gapcert_functions.products import Factor as Factor
 from gapcert_functions.products import Term as Term

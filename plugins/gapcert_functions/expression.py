@@ -14,10 +14,9 @@ import numpy as np
 
 from gapcert.plugin import Array, Interval
 
-from .thresholds import THRESHOLDS
-
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = float(np.finfo(np.float64).tiny)
+_POINTS = 1 << 16  # of a quadrature over all axes, at most; chosen, not measured
 
 
 def _tanh_slope(x: Interval) -> Interval:
@@ -75,7 +74,7 @@ class Expression:
     def mean(self, box: Interval) -> float:
         """Over a box (1, nz): a product of Gauss–Legendre rules over the axes that it involves, about where there are kinks."""
         axes = sorted(self.axes)
-        nodes, weights = np.polynomial.legendre.leggauss(min(64, int(THRESHOLDS.quadrature_points ** (1 / max(1, len(axes))))))
+        nodes, weights = np.polynomial.legendre.leggauss(min(64, int(_POINTS ** (1 / max(1, len(axes))))))
         z = np.zeros((len(nodes) ** len(axes), box.shape[1]))
         for j, x in zip(axes, np.meshgrid(*[nodes] * len(axes), indexing="ij"), strict=True):
             z[:, j] = (box.lo[0, j] + box.hi[0, j]) / 2 + (box.hi[0, j] - box.lo[0, j]) / 2 * x.reshape(-1)

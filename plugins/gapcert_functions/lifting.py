@@ -22,11 +22,12 @@ from scipy.spatial import cKDTree
 from gapcert.plugin import Array, Interval, UsageError, Zone
 
 from .bounded_function import Function
-from .thresholds import THRESHOLDS
 
 Index = npt.NDArray[np.intp]
 
 _EPS = float(np.finfo(np.float64).eps)
+_BATCH = 4096  # boxes that are cut in a round; chosen, not measured
+_NEAR = 24  # samples that a box looks at
 
 
 @final
@@ -113,7 +114,7 @@ class Cones:
 
     def near(self, z: Array) -> Index:
         """(n, k): some samples near each point, as the constants measure distance."""
-        k = min(THRESHOLDS.near_samples, len(self.z))
+        k = min(_NEAR, len(self.z))
         return np.asarray(self._tree.query(z * self.constants, k=k, p=1.0)[1]).reshape(len(z), k)
 
     def lifted(self, boxes: Interval, slope: Array, bend: Array) -> Bounded:
@@ -208,7 +209,7 @@ def lift(
         if not len(boxes) or spent >= budget:
             break
         order = np.argsort(goal[cell] - found.upper, kind="stable")
-        first, rest = order[: THRESHOLDS.cut_boxes], order[THRESHOLDS.cut_boxes :]
+        first, rest = order[:_BATCH], order[_BATCH:]
         halves = boxes[first].cut(found.axis[first], found.cut[first])
         own, which, parents = np.tile(cell[first], 2), np.tile(part[first], 2), np.tile(found.upper[first], 2)
         if zone.relations:

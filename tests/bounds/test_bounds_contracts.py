@@ -138,6 +138,18 @@ CENTRE_OF_REMAINDER = {
 NOT_SUBTRACTED = {**KNOWN, "remainder_ends_over": lambda self, boxes: self.ends_over(boxes)}
 
 
+def constant(factor, slope=0.0):
+    """The constant majorant times a factor."""
+
+    def majorant_over(self, boxes, cells=0):
+        c = factor * self.gamma_over(boxes)
+        return c, np.full((*c.shape, boxes.shape[1]), slope)
+
+    return {"majorant_over": majorant_over}
+
+
+FLAT_MAJORANT = {"majorant_over": lambda self, boxes, cells: (self.gamma(boxes.mid), np.zeros((*boxes.shape[:1], 2, 3)))}
+
 FAMILY_FAULTS = {
     "test_declares_itself": [Misnamed, UnknownRoute],
     "test_shapes_and_order": [made(interval=swapped), made(interval=single)],
@@ -150,6 +162,7 @@ FAMILY_FAULTS = {
         made(interval_over=times_radius),
     ],
     "test_lipschitz_holds_in_boxes": [made(lipschitz=lambda self, b: Cone.lipschitz(self, b) * 0.99)],
+    "test_majorant_holds_in_boxes": [made(**m) for m in (FLAT_MAJORANT, constant(1.1), constant(5.0, -0.01))],
     "test_batch_equals_singles": [made(interval=batched)],
     "test_fit_is_deterministic": [Drifts],
     "test_fit_changes_nothing": [Vandal],

@@ -14,7 +14,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gapcert as gc
-import gapcert_functions
 import gapcert_networks
 from gapcert.certification.coordinates import Coordinates, RelativeGap, RelativePredictor
 from gapcert.contracts.gaps.predictor import Predictor
@@ -126,7 +125,7 @@ def test_it_holds_at_points_of_boxes(name: str, predictor: str) -> None:
 def test_affine_majorants_hold_at_points_of_boxes(name: str) -> None:
     """Where cells meet at jumps, too."""
     gap, some, rng = made(name, "affine"), boxes(2)[::8], np.random.default_rng(4)
-    c, a = gapcert_functions.majorant_over(gap, some, 40 * len(some))
+    c, a = gap.majorant_over(some, 40 * len(some))
     for k in range(60):
         share = float(k) if k < 2 else rng.random(some.shape)
         z = np.clip(some.lo + share * (some.hi - some.lo), some.lo, some.hi)

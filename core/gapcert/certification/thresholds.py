@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import final
 
-from gapcert.numerics.thresholds import chosen, threshold
+from gapcert.thresholds import chosen, threshold
 
 
 @final

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from gapcert.numerics.arrays import Array, Bools
 from gapcert.numerics.errors import UsageError
 from gapcert.numerics.intervals import Interval
-from gapcert.numerics.thresholds import THRESHOLDS
+from gapcert.thresholds import THRESHOLDS
 
 _DEPTH = 1e-12  # moved points end this far inside (relative), so that rounding cannot push them out
 _TINY = float(np.finfo(np.float64).tiny)

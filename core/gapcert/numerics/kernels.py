@@ -26,7 +26,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar, cast, final
 
-from gapcert.numerics.thresholds import THRESHOLDS
+from gapcert.thresholds import THRESHOLDS
 
 F = TypeVar("F", bound=Callable[..., Any])
 

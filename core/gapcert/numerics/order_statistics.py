@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.errors import UsageError
-from gapcert.numerics.thresholds import THRESHOLDS
+from gapcert.thresholds import THRESHOLDS
 
 STREAM = 0xCA11B
 """Calibration k draws its points from (seed, k, STREAM), the audit after it from (seed, k)."""

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import final
 
-from gapcert.numerics.thresholds import chosen
+from gapcert.thresholds import chosen
 
 
 @final

@@ -125,6 +125,22 @@ class GapFamilyContract(ABC):
                 allowed = (slope * np.abs(a - b)[:, None, :]).sum(axis=2) + 1e-13 * (gap.gamma(a) + gap.gamma(b))
                 expect(bool((change <= allowed).all()), "γ changes by more than lipschitz allows within a box")
 
+    def test_majorant_holds_in_boxes(self) -> None:
+        for problem, gap in self._fits():
+            boxes = self._boxes(problem)[::20]
+            c, a = gap.majorant_over(boxes, 24 * len(boxes))
+            shapes = (len(boxes), problem.domain.nx), (len(boxes), problem.domain.nx, boxes.shape[1])
+            expect((c.shape, a.shape) == shapes, f"majorant_over has shapes {c.shape} and {a.shape}; expected {shapes}")
+            expect(bool((c >= 0).all() and (a >= 0).all()), "the affine majorant has a negative coefficient")
+            for z in _inside(boxes):
+                most = c + (a * np.abs(z)[:, None, :]).sum(axis=2)
+                expect(bool((gap.gamma(z) <= most).all()), "γ lies above its affine majorant in a box")
+            z = np.linspace(boxes.lo, boxes.hi, 101)
+            mean = c + (a * np.abs(z).mean(axis=0)[:, None, :]).sum(axis=2)
+            expect(
+                bool((mean <= gap.gamma_over(boxes) * 1.01).all()), "the affine majorant lies above a constant one on average"
+            )
+
     def test_batch_equals_singles(self) -> None:
         for problem, gap in self._fits():
             z = self._fresh(problem)

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg
 
 from gapcert import Array, Domain, Interval
-from gapcert_functions import majorant_of
+from gapcert.plugin import majorant_of
 from gapcert_mpc.thresholds import THRESHOLDS
 
 from .linearise import Frame, Nominal, Stages, in_frame, tiles

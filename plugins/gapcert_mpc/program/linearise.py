@@ -9,9 +9,9 @@ from typing import final
 
 import numpy as np
 
+import gapcert
 from gapcert import Array, GapFunction, Interval, Model
-from gapcert.plugin import Bools
-from gapcert_functions import majorant, majorant_of
+from gapcert.plugin import Bools, majorant_of
 from gapcert_mpc.thresholds import THRESHOLDS
 
 
@@ -144,7 +144,7 @@ class Nominal:
         c, G = (over - shift).mag.max(axis=0), np.zeros((self.nx, len(low)))
         if not (constant or cut) and np.isfinite(c).all():
             # Imported by name it would be the module of this name to the import contracts.
-            c, G = majorant((over - shift).mag, cells.lo, cells.hi, centre)
+            c, G = gapcert.plugin.majorant((over - shift).mag, cells.lo, cells.hi, centre)
         elif not constant and np.isfinite(c).all():
             c, G = majorant_of(lambda cells: (wrong(cells) - shift).mag, low, high, centre, THRESHOLDS.slope_cells // 4)
         units = slope, self(centre[None])[0] + shift, c, G

@@ -87,6 +87,16 @@ class GapFunction(ABC):
         """Column i of `gamma_over` (n,), where one state is wanted and costs less than all."""
         return np.asarray(self.gamma_over(boxes)[:, i])
 
+    def majorant_over(self, boxes: Interval, cells: int = 4096) -> tuple[Array, Array]:
+        """(c, A): γ_i(z) ≤ c_i + Σ_j A_ij |z_j| on each box, c, A ≥ 0 of shapes (n, nx), (n, nx, nz).
+
+        The better, in its mean over the box, of `majorant` from cells in it, and of the slopes of `lipschitz`; at worst it is
+        constant. cells: about how many there are, shared by the boxes.
+        """
+        from gapcert.numerics.majorant import majorants
+
+        return majorants(self.gamma_over, self.lipschitz, boxes, cells)
+
     @abstractmethod
     def lipschitz(self, boxes: Interval) -> Array:
         """L (n, nx, nz): |γ_i(z) − γ_i(z′)| ≤ Σ_j L_ij |z_j − z′_j| on each box; ∞ along an axis across which γ may jump."""

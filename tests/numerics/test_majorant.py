@@ -18,10 +18,9 @@ import gapcert as gc
 from gapcert_bounds.families.basis import BasisGap
 from gapcert_bounds.families.terms import parse
 from gapcert_bounds.testing.fields import Waves, gap_problem
-from gapcert_functions import cells_of, majorant, majorant_of, majorant_over
 
 Array = np.ndarray
-module = importlib.import_module("gapcert_functions.majorant")
+module = importlib.import_module("gapcert.numerics.majorant")
 
 
 def grid(low: Array, high: Array, counts: tuple[int, ...]) -> gc.Interval:
@@ -53,7 +52,7 @@ def short(cells: gc.Interval, bounds: Array, centre: Array, found: tuple[Array, 
 @given(seed=st.integers(0, 2**32 - 1))
 def test_it_holds_in_every_cell(seed: int) -> None:
     cells, bounds, centre = drawn(seed)
-    c, a = found = majorant(bounds, cells.lo, cells.hi, centre)
+    c, a = found = gc.plugin.majorant(bounds, cells.lo, cells.hi, centre)
     assert (c >= 0).all()
     assert (a >= 0).all()
     assert short(cells, bounds, centre, found) <= 0
@@ -81,7 +80,7 @@ def test_it_fails_without_its_parts(name: str, fault: Callable[..., Any], monkey
     """The solver's tolerance, and the least distance in a cell."""
     monkeypatch.setattr(module, name, fault)
     monkeypatch.setattr(module, "_raised", lambda c, most, nz: c)
-    worst = max(short(*case, majorant(case[1], case[0].lo, case[0].hi, case[2])) for case in map(drawn, range(40)))
+    worst = max(short(*case, gc.plugin.majorant(case[1], case[0].lo, case[0].hi, case[2])) for case in map(drawn, range(40)))
     assert worst > 0
 
 
@@ -103,10 +102,10 @@ def test_a_slope_is_recovered() -> None:
     """γ = 0.1 + 0.5 |u|, by cells and by `lipschitz`; the constant is 1.6."""
     one = gap("1", "abs(u0)", weights=[[0.1, 0.5]])
     low, high = np.array([-1.0, -2.0, -3.0]), np.array([1.0, 2.0, 3.0])
-    cells, bounds = cells_of(one.gamma_over, low, high, np.zeros(3))
+    cells, bounds = gc.plugin.cells_of(one.gamma_over, low, high, np.zeros(3))
     for c, a in (
-        majorant(bounds, cells.lo, cells.hi, np.zeros(3)),
-        (m[0] for m in majorant_over(one, gc.Interval(low[None], high[None]))),
+        gc.plugin.majorant(bounds, cells.lo, cells.hi, np.zeros(3)),
+        (m[0] for m in one.majorant_over(gc.Interval(low[None], high[None]))),
     ):
         assert 0.1 <= c[0] <= 0.105
         assert a[0] == pytest.approx([0, 0, 0.5], abs=0.005)
@@ -120,7 +119,7 @@ def test_slopes_are_taken_where_they_are_better(factor: float, monkeypatch: pyte
     monkeypatch.setattr(type(one), "lipschitz", lambda self, boxes: factor * exact(self, boxes))
     low = np.array([[-1.0, -1.0, -1.0], [0.3, -1.0, -2.0], [-2.0, 0.5, 0.1]])
     some, bad = gc.Interval(low, low + np.array([[2.0, 2.0, 2.0], [1.0, 0.5, 1.5], [1.0, 0.5, 0.4]])), 0
-    c, a = majorant_over(one, some, 1)
+    c, a = one.majorant_over(some, 1)
     for share in (np.zeros(3), np.ones(3), *np.random.default_rng(0).random((200, 3))):
         z = some.lo + share * (some.hi - some.lo)
         bad += int((one.gamma(z) > c + (a * np.abs(z)[:, None, :]).sum(axis=2)).sum())
@@ -137,10 +136,10 @@ def test_slopes_along_several_axes_around_any_centre() -> None:
         return np.stack([0.1 + 0.5 * away[:, 2] + 0.2 * away[:, 0]], axis=1)
 
     low, high = np.array([-1.0, -2.0, -1.0]), np.array([1.0, 2.0, 1.0])
-    cells, bounds = cells_of(bound, low, high, centre)
+    cells, bounds = gc.plugin.cells_of(bound, low, high, centre)
     assert np.prod(cells.hi - cells.lo, axis=1).sum() == pytest.approx(16.0)
     assert len(cells) <= module.THRESHOLDS.majorant_cells
-    c, a = majorant(bounds, cells.lo, cells.hi, centre)
+    c, a = gc.plugin.majorant(bounds, cells.lo, cells.hi, centre)
     assert 0.1 <= c[0] <= 0.1 + 0.04 * 1.05
     assert a[0] == pytest.approx([0.2, 0, 0.5], abs=0.03)
     assert np.ptp(cells.hi[:, 1] - cells.lo[:, 1]) == 0, "cut along an axis on which nothing depends"
@@ -153,8 +152,8 @@ def test_eight_dimensions() -> None:
         return np.stack([0.1 + z.mag[:, 0] + 0.5 * z.mag[:, 7] ** 2], axis=1)
 
     low, high, zero = -np.ones(8), np.ones(8), np.zeros(8)
-    cells, bounds = cells_of(bound, low, high, zero, 1000)
-    c, a = majorant(bounds, cells.lo, cells.hi, zero)
+    cells, bounds = gc.plugin.cells_of(bound, low, high, zero, 1000)
+    c, a = gc.plugin.majorant(bounds, cells.lo, cells.hi, zero)
     z = np.random.default_rng(0).uniform(-1, 1, (20_000, 8))
     most = c + np.abs(z) @ a.T
     assert (most >= bound(gc.Interval.exact(z))).all()
@@ -169,9 +168,9 @@ def test_each_function_has_its_own_cells() -> None:
     def bound(z: gc.Interval) -> Array:
         return np.stack([z[:, :2].mag.sum(axis=1), z[:, 2:].mag.sum(axis=1)], axis=1)
 
-    c, a = majorant_of(bound, low, high, zero, 1000)
-    cells, bounds = cells_of(bound, low, high, zero, 1000)
-    shared, slopes = majorant(bounds, cells.lo, cells.hi, zero)
+    c, a = gc.plugin.majorant_of(bound, low, high, zero, 1000)
+    cells, bounds = gc.plugin.cells_of(bound, low, high, zero, 1000)
+    shared, slopes = gc.plugin.majorant(bounds, cells.lo, cells.hi, zero)
     assert (c + a.sum(axis=1) / 2 < 1.25).all()
     assert (shared + slopes.sum(axis=1) / 2 > 1.3).all()
     z = np.random.default_rng(0).uniform(-1, 1, (5000, 4))
@@ -186,22 +185,22 @@ def test_what_does_not_pay_is_not_asked() -> None:
         asked += len(z)
         return np.full((len(z), 2), 0.3)
 
-    cells, bounds = cells_of(bound, -np.ones(8), np.ones(8), np.zeros(8))
+    cells, bounds = gc.plugin.cells_of(bound, -np.ones(8), np.ones(8), np.zeros(8))
     assert (len(cells), asked) == (1, 1 + 3 * 8)
-    c, a = majorant(bounds, cells.lo, cells.hi, np.zeros(8))
+    c, a = gc.plugin.majorant(bounds, cells.lo, cells.hi, np.zeros(8))
     assert c == pytest.approx([0.3, 0.3])
     assert not a.any()
 
 
 def test_infinite_bounds_and_boxes_that_are_points() -> None:
     cells = grid(np.zeros(2), np.ones(2), (2, 1))
-    c, a = majorant(np.array([[1.0, 1.0], [np.inf, 2.0]]), cells.lo, cells.hi, np.zeros(2))
+    c, a = gc.plugin.majorant(np.array([[1.0, 1.0], [np.inf, 2.0]]), cells.lo, cells.hi, np.zeros(2))
     assert np.isinf(c[0])
     assert not a[0].any()
     assert np.isfinite(c[1])
     one = gap("1", "x0", "u0^2")
     z = np.array([[0.5, 0.1, -2.0], [-1.0, 0.0, 1.0]])
-    c, a = majorant_over(one, gc.Interval.exact(z))
+    c, a = one.majorant_over(gc.Interval.exact(z))
     most = c + (a * np.abs(z)[:, None]).sum(axis=2)
     assert most == pytest.approx(one.gamma(z))
 
@@ -210,8 +209,8 @@ def test_weights_move_it_to_where_they_are() -> None:
     """γ = |u|³ on [−1, 1]: low near 0 if points lie there, low at the ends if they lie there."""
     cells = grid(np.array([-1.0]), np.array([1.0]), (200,))
     bounds = np.abs(np.stack([cells.lo, cells.hi])).max(axis=0) ** 3
-    near = majorant(bounds, cells.lo, cells.hi, np.zeros(1), np.array([0.01]))
-    far = majorant(bounds, cells.lo, cells.hi, np.zeros(1))
+    near = gc.plugin.majorant(bounds, cells.lo, cells.hi, np.zeros(1), np.array([0.01]))
+    far = gc.plugin.majorant(bounds, cells.lo, cells.hi, np.zeros(1))
     assert near[0] < 0.02
     assert near[0] + near[1][0] * 0.01 <= far[0] + far[1][0] * 0.01
 
@@ -223,7 +222,7 @@ def test_over_boxes_it_holds_between_samples() -> None:
     rng = np.random.default_rng(0)
     low = rng.uniform(-1, 0.5, (4, 3))
     boxes = gc.Interval(low, low + rng.uniform(0.05, 0.5, (4, 3)))
-    c, a = majorant_over(one, boxes, 400)
+    c, a = one.majorant_over(boxes, 400)
     for _ in range(200):
         z = boxes.lo + rng.random(boxes.shape) * (boxes.hi - boxes.lo)
         assert (one.gamma(z) <= c + (a * np.abs(z)[:, None, :]).sum(axis=2)).all()
@@ -246,4 +245,4 @@ def test_over_boxes_it_holds_between_samples() -> None:
 )
 def test_bad_input(bounds: Array, low: Array, high: Array, centre: Array) -> None:
     with pytest.raises(gc.UsageError, match="majorant: found bounds"):
-        majorant(bounds, low, high, centre)
+        gc.plugin.majorant(bounds, low, high, centre)

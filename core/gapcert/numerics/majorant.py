@@ -7,9 +7,10 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.plugin import Array, GapFunction, Interval, UsageError
-
-from .thresholds import THRESHOLDS
+from gapcert.numerics.arrays import Array
+from gapcert.numerics.errors import UsageError
+from gapcert.numerics.intervals import Interval
+from gapcert.thresholds import THRESHOLDS
 
 _EPS = float(np.finfo(np.float64).eps)
 
@@ -102,14 +103,12 @@ def cells_of(
     return cells, bounds
 
 
-def majorant_over(gap: GapFunction, boxes: Interval, cells: int = THRESHOLDS.majorant_cells) -> tuple[Array, Array]:
-    """(c, A): γ_i(z) ≤ c_i + Σ_j A_ij |z_j| on each box, c, A ≥ 0 of shapes (n, nx), (n, nx, nz).
-
-    The better, in its mean over the box, of `majorant` from cells in it, and of the slopes of `lipschitz`; at worst it is
-    constant. cells: about how many there are, shared by the boxes.
+def majorants(bound: Bound, lipschitz: Bound, boxes: Interval, total: int) -> tuple[Array, Array]:
+    """(c, A), (n, nx) and (n, nx, nz), of a function below `bound` with slopes below `lipschitz` (n, nx, nz): the better of
+    `majorant` and of these slopes, per box and function; the centre is 0. total: cells in all boxes.
     """
-    bound, centre, count = gap.gamma_over, np.zeros(boxes.shape[1]), cells // max(1, len(boxes))
-    c, a = _steep(bound, gap.lipschitz(boxes), boxes)
+    centre, count = np.zeros(boxes.shape[1]), total // max(1, len(boxes))
+    c, a = _steep(bound, lipschitz(boxes), boxes)
     for k, (low, high) in enumerate(zip(boxes.lo, boxes.hi, strict=True)):
         level, slope = majorant_of(bound, low, high, centre, count)
         e = _mean(low, high, centre)

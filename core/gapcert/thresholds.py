@@ -37,6 +37,11 @@ class Thresholds:
     zone_share: float = chosen(1e-3, "of the box: relations that leave less are refused, since points are drawn for ever")
     zone_steps: int = chosen(8, "per relation, to move a point into Z within its box")
     kept_folders: int = chosen(4, "of one package: those of other versions, or of other environments")
+    majorant_cells: int = chosen(4096, "at most: more are tighter, and take longer")
+    least_cut: int = chosen(16, "cells cut in a round")
+    cut_share: int = chosen(3, "of all cells, one in so many is cut in a round")
+    cut_tried: int = chosen(4, "cells of a round of which every axis is tried")
+    majorant_gain: float = chosen(0.01, "of the mean, with four times as many cells: it ends where less was gained")
     surprise: float = chosen(1e-3, "an audit refutes ε where so many violations, or more, are at most this probable under it")
 
 
