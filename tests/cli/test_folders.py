@@ -15,7 +15,6 @@ import pytest
 
 import gapcert as gc
 from gapcert.cli.folders.cleaning import remove, seconds, size
-from gapcert.cli.folders.comparing import Figure, change, compare
 from gapcert.cli.folders.listing import entry, sized
 from gapcert.cli.folders.watching import Follower
 from gapcert.cli.main import main
@@ -28,6 +27,7 @@ from gapcert.run.lock import alive, myself, owned, owner
 from gapcert.run.manifest import enter, spec_of
 from gapcert.run.progress_rate import Pace, counted, duration, speed
 from gapcert.run.status import RunFolder, standing
+from gapcert_compare.run_folders import Figure, change, compare
 
 
 @pytest.fixture

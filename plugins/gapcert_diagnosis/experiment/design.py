@@ -215,7 +215,7 @@ def _within(
 
 
 def _played(fitted: Fit, u: Array, measured: Dataset) -> Array:
-    """Dataset channels (n, T, ny) of the fitted model under u (n, T, nu), from where the first recording started."""
+    """Measured channels (n, T, ny) of the fitted model under u (n, T, nu), from where the first recording started."""
     h, n, repeat = fitted.hypothesis, len(u), measured.repeat
     values = {**h.fixed, **dict(zip(h.names, map(float, fitted.theta), strict=True))}
     fine = np.repeat(u, repeat, axis=1)

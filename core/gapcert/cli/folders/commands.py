@@ -42,13 +42,6 @@ FOLDERS = (
     _command("runs", "listed", "list, compare, clean and resume run folders", *_CHOSEN),
     _command("runs list", "listed", "run folders with state, figures and size (what `gapcert runs` alone does)", *_CHOSEN),
     _command(
-        "runs compare",
-        "compare",
-        "what differs between the specs of runs, and which figures changed beyond noise",
-        Argument("RUNS", "run folders, the first of which the others are held against", {"metavar": "RUN", "nargs": "+"}),
-        Argument("--all", "show figures that are the same, too", _TICK),
-    ),
-    _command(
         "runs clean",
         "clean",
         "which run folders would go; with --yes they do",
@@ -88,17 +81,6 @@ def listed(options: Arguments) -> Answer:
 
 def _filtered(options: Arguments) -> str:
     return " that match" if options.name or options.state else ""
-
-
-def compare(options: Arguments) -> Answer:
-    from gapcert.cli.folders.comparing import compare as side_by_side
-    from gapcert.cli.folders.comparing import in_words
-    from gapcert.run.status import RunFolder
-
-    if len(options.runs) < 2:
-        raise UsageError("gapcert runs compare: one run folder was given; expected two or more")
-    told = side_by_side([RunFolder.at(path) for path in options.runs])
-    return Answer(told, in_words(told, options.all))
 
 
 def clean(options: Arguments) -> Answer:

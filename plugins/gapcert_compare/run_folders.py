@@ -9,11 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, final
 
-from gapcert.cli.folders.listing import entry
-from gapcert.numerics.texts import columns, leaves
-from gapcert.run.manifest import stored
-from gapcert.run.progress_rate import figure
-from gapcert.run.status import RunFolder
+from gapcert.plugin import Answer, Arguments, RunFolder, UsageError, columns, entry, figure, leaves, stored
 
 Change = Literal["same", "noise", "changed"]
 EXACT = 1e-9  # relative: figures without noise differ by rounding at most
@@ -29,6 +25,13 @@ class Figure:
     value: Any
     noise: Callable[[Any], bool] = lambda other: False
     spread: tuple[float, float] | None = None
+
+
+def command(options: Arguments) -> Answer:
+    if len(options.runs) < 2:
+        raise UsageError("gapcert runs compare: one run folder was given; expected two or more")
+    told = compare([RunFolder.at(path) for path in options.runs])
+    return Answer(told, in_words(told, options.all))
 
 
 def compare(runs: Sequence[RunFolder]) -> dict[str, Any]:
