@@ -18,7 +18,7 @@ os.environ["OMP_NUM_THREADS"] = "1"
 import numpy as np
 from harness import Row, main, row
 
-sys.path.append(str(Path(__file__).parents[1] / "tests" / "plugins" / "mpc"))
+sys.path.append(str(Path(__file__).parents[1] / "tests" / "mpc"))
 from test_nonlinear import CARTPOLE, CARTPOLE_GAP, CARTPOLE_Z, QUADROTOR, QUADROTOR_GAP, QUADROTOR_Z, band, problem
 
 from gapcert import Interval

@@ -61,8 +61,8 @@ class Thresholds:
     shift_cells: int = chosen(4096, "of the default table of shifts, at most: more take longer than the band is worth")
     asked_points: int = chosen(4096, "at which the band is compared")
     exchange_error: float = chosen(1e-7, "of the largest residual: what is left is repaired by an exact shift")
-    grouped_samples: int = chosen(256, "per group of near ones, that a box looks at together")
-    direct_samples: int = chosen(1024, "up to which groups cost more than they save")
+    grouped_points: int = chosen(256, "that are asked together: near ones share the cones that they need")
+    direct_points: int = chosen(1024, "up to which groups cost more than they save")
     mean_cones: int = chosen(8, "that join a mean, at most: more tighten it little")
     mean_near: float = chosen(1e-3, "of what a cone moves over the box: a bound that is so near is enough")
 

@@ -59,7 +59,7 @@ def _spec(model: Model) -> Mapping[str, Any]:
 
 
 def _known(name: str) -> bool:
-    """Is a class part of Gapcert, or of a package that declares gap families, or routes that move them?"""
+    """Is a class part of Gapcert, of its kits of gaps, or of a package that declares gap families, or routes that move them?"""
     parts = name.partition(":")[0].split(".")
     # A module such as __main__ does something when it is imported.
     return parts[0] in _packages() and not any(part.startswith("_") for part in parts)

@@ -56,7 +56,7 @@ class Thresholds:
     many_boxes: int = chosen(200, "at once, from which on a set of them is kept")
     kept_sets: int = chosen(4, "of boxes")
     slope_pieces: int = chosen(4, "on either side of θ̂, along which slopes are bounded one by one")
-    starts: int = chosen(64, "that a domain's fraction is looked at from: each is a search")
+    starts: int = chosen(64, "that a domain's fraction is looked at from: each may be a search")
     sls_tolerance: float = chosen(1e-9, "of the cost, at which a program counts as solved")
     sls_inside: float = chosen(1e-8, "rows are solved for limits this part further inside, so that they then hold exactly")
     sls_hopeless: float = chosen(1e8, "times the cost without rows: a plan that costs more counts as none")

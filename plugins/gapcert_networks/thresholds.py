@@ -26,7 +26,7 @@ class Thresholds:
     few_gates: int = chosen(3, "open ones per input: they are told apart at once")
     some_gates: int = chosen(5, "open ones per input: they are told apart after `gate_boxes`")
     gate_boxes: int = chosen(4096, "that are bounded before some gates are told apart")
-    most_gates: int = chosen(40, "open ones over the whole domain, from which they are never told apart")
+    most_gates: int = chosen(40, "open ones over the whole domain, above which they are never told apart")
     gate_nodes: int = chosen(2000, "over the patterns of a box, at most")
     split_boxes: int = chosen(4096, "open ones that are all split in a round, else the worse half")
     scaling_sweeps: int = chosen(10, "through the layers: each wins less")

@@ -122,7 +122,7 @@ class Client:
         self._values = dict(values)
 
     def masses(self) -> list[BodyInertia]:
-        """Of the links of one robot that move."""
+        """Of the links that move, of all copies."""
         return [own for _, own, _ in self._moving]
 
     def _bodies(self) -> list[tuple[int, BodyInertia, tuple[float, ...]]]:

@@ -15,7 +15,7 @@ _REACH: Colour = (36, 54, 82, 255)
 
 
 def draw_gap(canvas: Canvas, gap: GapFigure) -> None:
-    """Per state: true gap beside γ as maps, and the residual in its band along the axis where it varies most."""
+    """Per state: true gap beside γ as maps, and the residual in its band along the axis that leads."""
     for s in gap.slices:
         root, top = f"gap/{s.state}", float(np.nanmax([s.gamma, s.gap]))
         left, right = Plane(gap.axes[0], gap.axes[1]), Plane(gap.axes[0], gap.axes[1], STEP)

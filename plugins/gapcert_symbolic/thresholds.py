@@ -13,7 +13,9 @@ class Thresholds:
 
     # cells
     memory: float = chosen(8e9, "bytes that a game may need: what a workstation has to spare")
-    cell_bytes: int = chosen(8, "per cell, without its inputs: what the tables of a solver hold")
+    cell_bytes: int = chosen(
+        8, "per cell, without its inputs: what the table of values holds, others that a solver keeps beside it left out"
+    )
     gap_boxes: int = chosen(60_000, "over which a gap is bounded: more are tighter, and take longer")
     window_entries: int = threshold(1 << 27, "by the formula: 8 bytes of each are 1 GiB, an eighth of `memory`")
     shared_change: float = chosen(1e-3, "of a cell: what is not worth a longer table")

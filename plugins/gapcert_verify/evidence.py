@@ -294,7 +294,7 @@ def bounds(e: Evidence, z: Array, stored: str) -> tuple[Interval, Interval]:
 
 def uncalibrated(e: Evidence, z: Array, stored: str) -> tuple[Interval, Interval]:
     """(l, u) as the family made them."""
-    form = e.data["form"]["form"]
+    form = str(e.data["form"]["form"])
     if form in _BANDS:
         return _BANDS[form](e, z, predictor(e, z, stored))
     if form in _BOUNDS:

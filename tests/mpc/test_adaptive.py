@@ -418,7 +418,7 @@ def test_a_rod_in_bullet_that_is_heavier_than_its_data_sheet(tmp_path):
     model = build.make("model")
     backend, domain = build.against(model)
     gap = build.certify(model, backend, domain, tmp_path, silent).gap
-    c = build.controller().synthesize(SynthesisProblem(model, gap, domain, spec.goal(domain)))
+    c = build.make("controller").synthesize(SynthesisProblem(model, gap, domain, spec.goal(domain)))
     x = c.draw(20, np.random.default_rng(0))[:10]
     trace = closed_loop(backend, c, x, 25)
     assert not trace.violation.any()

@@ -30,7 +30,8 @@ def tier(item: pytest.Item) -> str:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Marks what a shipped contract asks of a plugin, wherever its class is, and what is marked as nothing else."""
     for item in items:
-        if str(getattr(getattr(item, "function", None), "__module__", "")).partition(".")[2].startswith("testing"):
+        package, _, module = str(getattr(getattr(item, "function", None), "__module__", "")).partition(".")
+        if package.startswith("gapcert") and module.startswith("testing"):
             item.add_marker("contract")
         if not any(item.get_closest_marker(t) for t in TIERS):
             item.add_marker("unit")

@@ -232,8 +232,9 @@ def _predictor(choice: Any, samples: Samples, model: Model, domain: Domain) -> P
     if choice == "affine":
         return AffinePredictor.fit(samples)
     if callable(choice):
-        predictor: Predictor = choice(samples, domain)
-        return predictor
+        if not isinstance(made := choice(samples, domain), Predictor):
+            raise UsageError(f"certify: what makes the predictor gave {made!r}; expected a Predictor")
+        return made
     if choice == "none":
         return AffinePredictor.none(samples.r.shape[1], samples.z.shape[1])
     raise UsageError(

@@ -20,8 +20,8 @@ class Thresholds:
     # bounds
     trail_parts: int = chosen(4, "of a pair in each step: a jump's slope then grows by 4, a settled one by 1")
     trail_clear: float = chosen(16.0, "resolutions: smaller changes tell nothing")
-    supremum_batch: int = chosen(2048, "boxes of a round: fewer go to the widest first, more cost less each")
-    supremum_probes: int = chosen(64, "boxes of a round whose centres are asked, for a lower end")
+    supremum_batch: int = chosen(2048, "boxes of a round: fewer go to the largest bound first, more cost less each")
+    supremum_probes: int = chosen(64, "boxes of a round whose centres and corners are asked, for a lower end")
     # gates
     hidden_vertices: int = chosen(64, "of declared ranges, at most: beyond six numbers they are drawn")
     hidden_move: float = chosen(0.1, "of a hidden number without a range, in rad, m, rad/s, …; 1 where it has no unit")
@@ -34,7 +34,7 @@ class Thresholds:
     spread_points: int = chosen(64, "at which the spread over hidden states is measured")
     spread_draws: int = chosen(16, "hidden states at each of these")
     purity_rows: int = chosen(64, "that are asked again in other orders and shapes")
-    held_periods: int = chosen(512, "at most, for which a system is left alone between two answers")
+    held_periods: int = chosen(512, "at most, that one row is asked in a row: a counter in a system shows by then")
     response_error: float = chosen(0.1, "relative, between what an input moves in f̂ and in f: a warning, no refusal")
     response_rows: int = chosen(16, "states at which an input is moved from end to end")
     # samples

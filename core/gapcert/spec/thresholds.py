@@ -12,7 +12,7 @@ class Thresholds:
     """Read as `THRESHOLDS.name`."""
 
     # editors
-    editor_bytes: int = chosen(1 << 20, "of a file in which an editor's settings are looked for")
+    editor_bytes: int = chosen(1 << 20, "of a file that an editor is asked to take for a spec: larger ones are data")
     editor_depth: int = chosen(4, "of folders in which specs are looked for")
     # text
     extending_files: int = chosen(32, "that extend each other, at most")

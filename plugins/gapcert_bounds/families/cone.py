@@ -180,14 +180,14 @@ class Cones:
 
         Of few points no groups are made, as nothing would be won.
         """
-        if len(z) < THRESHOLDS.direct_samples:
+        if len(z) < THRESHOLDS.direct_points:
             return np.arange(len(z)), np.zeros(0, dtype=np.intp)
         low, width = z.min(axis=0), np.ptp(z, axis=0)
         weight = self._lipschitz * width
         total = weight.sum(axis=1, keepdims=True)
         weight = np.divide(weight, total, out=np.zeros_like(weight), where=total > 0).max(axis=0)
         counts = np.ones(z.shape[1], dtype=np.int64)
-        target = min(len(z) // THRESHOLDS.grouped_samples, 1 << 15)
+        target = min(len(z) // THRESHOLDS.grouped_points, 1 << 15)
         while counts.prod() < target and (weight / counts).max() > 0:
             counts[np.argmax(weight / counts)] *= 2
         cell = np.zeros(len(z), dtype=np.uint16)

@@ -125,7 +125,7 @@ class Library:
     def freed(self, c: Candidate) -> Parameter | None:
         """The parameter of the model that a candidate frees, as it is stated; None of a law, which has numbers of its own."""
         name = self.extension(c).frees
-        return None if name is None else next(p for p in self.model.parameters if p.name == name)
+        return None if name is None else next((p for p in self.model.parameters if p.name == name), None)
 
     def loosened(self, c: Candidate) -> str | None:
         """The parameter of which a candidate lifts the tolerance: it is among the free numbers of every hypothesis."""

@@ -25,7 +25,8 @@ class Law(gc.plugin.Effect):
     where: ClassVar[tuple[Callable[[str, gc.Model], object], ...]] = ()
 
     def __init_subclass__(cls) -> None:
-        cls.sentence = SENTENCES.get(getattr(cls, "name", ""), "")
+        if "sentence" not in vars(cls):
+            cls.sentence = SENTENCES.get(getattr(cls, "name", ""), "")
 
     def applies(self, site: str, model: gc.Model) -> bool:
         return all(holds(site, model) for holds in self.where)

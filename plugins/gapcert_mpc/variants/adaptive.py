@@ -210,7 +210,7 @@ class AdaptiveMpcController(Controller):
 
     def theta(self, memory: Ints) -> Interval:
         """Θ of each run, (n, nθ)."""
-        held = [h.theta for h in self._held(memory).values()]
+        held = [self._held(memory)[i].theta for i in range(len(memory))]
         return Interval(np.array([t.lo for t in held]), np.array([t.hi for t in held]))
 
     def learned(self, memory: Ints) -> dict[str, Array]:

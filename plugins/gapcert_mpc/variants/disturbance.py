@@ -247,7 +247,16 @@ class DisturbanceMpcController(PlanController[Run]):
     @classmethod
     def load(cls, folder: Path | str) -> DisturbanceMpcController:
         """Inverse of `save`."""
-        return loaded(folder, lambda data, arrays: cls(MpcController.read(Path(folder), data, arrays, None)))
+
+        def made(data: Mapping[str, Any], arrays: Mapping[str, Array]) -> DisturbanceMpcController:
+            fixed = MpcController.read(Path(folder), data, arrays, None)
+            if not fixed.wins:
+                raise UsageError(
+                    f"{Path(folder)}: controller.npz and controller.json do not belong together; synthesize it again"
+                )
+            return cls(fixed)
+
+        return loaded(folder, made)
 
 
 def answering(task: Task) -> Controller:

@@ -57,7 +57,7 @@ class Problem:
     target have value 0 and every input that is allowed: the promise ends there.
 
     windows: made where a solver asks for them; dynamics: what they are made of, where there may be another way: it may take
-    `safe` for its own. solver: as the option says. threads: how many it may use; what is found does not depend on it.
+    `safe` for its own. solver: as the option says. threads: how many it may use; values and inputs do not depend on it.
     """
 
     windows: Callable[[], Windows]
