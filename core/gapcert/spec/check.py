@@ -21,7 +21,7 @@ from gapcert.spec.sections.areas import GoalConfig
 from gapcert.spec.sections.config import Config
 from gapcert.spec.sections.hidden import HINT, WORDS, HiddenConfig, Sampled
 from gapcert.spec.sections.plugin_sections import contributed
-from gapcert.spec.sections.unsimulated import measured
+from gapcert.spec.sections.simulator_absence import measured
 from gapcert.spec.text.compose import crowded, matching, near_file, regular
 from gapcert.spec.text.source import At, Problem, Tree, dotted
 

@@ -16,7 +16,7 @@ from gapcert.spec.sections.cuts import cut_problems
 from gapcert.spec.sections.hidden import HiddenConfig
 from gapcert.spec.sections.plugin_sections import Axes, SpecSection
 from gapcert.spec.sections.sections import GridSampling, LatticeSampling
-from gapcert.spec.sections.unsimulated import declared, declared_problems, measured, measured_problems, unasked
+from gapcert.spec.sections.simulator_absence import declared, declared_problems, measured, measured_problems, unasked
 from gapcert.spec.text.source import At, Problem
 
 NEEDS = {
@@ -184,7 +184,7 @@ def _keyed(config: Any, section: Any, at: At, of_model: Axes) -> list[Problem]:
     found: list[Problem] = []
     for key in of_config(config, "keyed"):
         path, units = (*at, key.option), getattr(of_model, key.axes)
-        # States that are none are told where they are named first.
+        # A name that is no state of the model is reported where states are named first.
         want = {n: u for n, u in units.items() if key.among is None or n in key.among}
         if key.option not in section or (have := getattr(config, key.option)) is None:
             continue

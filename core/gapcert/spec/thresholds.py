@@ -16,7 +16,7 @@ class Thresholds:
     editor_depth: int = chosen(4, "of folders in which specs are looked for")
     # text
     extending_files: int = chosen(32, "that extend each other, at most")
-    matrix_specs: int = chosen(10_000, "that one matrix stands for, at most")
+    matrix_specs: int = chosen(10_000, "specs of one matrix, at most")
     folder_files: int = chosen(20_000, "of a folder that are looked at")
     spec_bytes: int = chosen(1_000_000, "of a file: a spec names its data, it does not hold them")
     spec_values: int = chosen(20_000, "with what aliases repeat: they may double per line")

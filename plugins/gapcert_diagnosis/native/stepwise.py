@@ -113,9 +113,9 @@ class EngineSearch:
     def shortlist(self, best: NativeFit) -> list[NativeFit]:
         """Fits, to some of the trajectories, of the most promising candidates, best first."""
         before = self.mean(best.model, self.few)
-        seen = [(n, self._try(best, n, (value,), self.few)) for _, n, value in self._screen(best)[: THRESHOLDS.seen_nominees]]
+        seen = [(n, self._try(best, n, (value,), self.few)) for _, n, value in self._screen(best)[: THRESHOLDS.seen_candidates]]
         screened = sorted(((s, n, value) for n, tried in seen for s, value in tried), key=lambda s: s[0])
-        picks = [s for s in screened if s[0] < before - THRESHOLDS.contact_hope][: THRESHOLDS.fitted_nominees]
+        picks = [s for s in screened if s[0] < before - THRESHOLDS.contact_hope][: THRESHOLDS.fitted_candidates]
         out = [f for _, n, value in picks if not _tolerated(f := self._begin(best, n, value))]
         return sorted(out, key=lambda f: self.mean(f.model, self.few))
 

@@ -15,7 +15,7 @@ from .svg import FAINT, GOOD, TRUTH, WITH, Paint, Picture, draw, heat, scaled
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-MOST_BANDS = 12
+MOST_BANDS = 12  # beside those that lead: more make a page that nobody scrolls through
 GAP = "gap"  # pictures with one cursor
 
 

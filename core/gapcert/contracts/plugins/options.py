@@ -70,4 +70,5 @@ class ConfigContract:
 
 def of_config(config: Any, name: str) -> Any:
     """What a config (or none) answers to a method of `ConfigContract`."""
-    return (getattr(type(config), name, None) or getattr(ConfigContract, name))(config)
+    own = getattr(type(config), name, None)
+    return (own if callable(own) else getattr(ConfigContract, name))(config)

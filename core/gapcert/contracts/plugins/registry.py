@@ -109,7 +109,7 @@ class Registry:
     def build(self, kind: str, name: str, config: Any = None, context: Context | None = None) -> Any:
         """Construct a component: `Class.from_config(config, context)` where defined, else `Class(**options)`.
 
-        An option whose class has a method `made(context)` stands for what that returns.
+        An option whose class has a method `made(context)` is replaced by what that returns.
         """
         component, context = self.get(kind, name), context or Context()
         if component.code and not context.allow_code:

@@ -335,7 +335,7 @@ class Extendable(ABC):
 
 
 class EngineHints:
-    """What a model knows of the physics engine that it stands for; by default there is none."""
+    """What a model knows of the physics engine whose motion it writes as equations; by default there is none."""
 
     doubts: Mapping[str, float] = types.MappingProxyType({})
     """Parameters without a tolerance that may be wrong all the same: name → a change that matters."""

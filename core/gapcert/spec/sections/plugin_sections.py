@@ -22,7 +22,7 @@ Schema = dict[str, Any]
 
 
 class Checker(Protocol):
-    """Who reads a spec, as its sections see it: what is wrong with one of them is said here, at its place."""
+    """What a section of a spec sees of its reader: it reports here what is wrong with the section, with the place."""
 
     problems: list[Problem]
     registry: Registry
