@@ -31,7 +31,7 @@ Bound = Callable[[gc.Interval], np.ndarray]
 
 
 def component(name: str, **options: object) -> gc.plugin.GapFamily:
-    made: gc.GapFamily = gc.registry().get("gap_family", name).load()(**options)
+    made: gc.plugin.GapFamily = gc.registry().get("gap_family", name).load()(**options)
     return made
 
 

@@ -39,7 +39,7 @@ def made(folder: Path) -> tuple[gc.System, gc.SynthesisProblem, Mpc]:
     model = build.make("model")
     backend, domain = build.against(model)
     gap = build.certify(model, backend, domain, folder, silent).gap
-    synthesizer = build.controller()
+    synthesizer = build.make("controller")
     assert isinstance(synthesizer, Mpc)
     return backend, gc.SynthesisProblem(model, gap, domain, spec.goal(domain)), synthesizer
 

@@ -64,7 +64,9 @@ def backend(kind: str, text: str, joints: int, folder: Path, name: str, **option
     }
     known, calm = gc.registry(), CALM if kind == "pybullet" else {}
     config: Any = known.config("backend", kind)
-    built: gc.EngineBackend = known.build("backend", kind, config.model_validate(section | calm | options), gc.Context())
+    built: gapcert_engines.EngineBackend = known.build(
+        "backend", kind, config.model_validate(section | calm | options), gc.Context()
+    )
     return built
 
 

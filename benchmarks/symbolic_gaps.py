@@ -22,6 +22,7 @@ import symbolic as published
 
 import gapcert as gc
 import gapcert_symbolic.cells.gaps as gaps
+from gapcert.spec.spec import Spec
 
 TURN = "atan(tan(steering)/2)"
 CAR = (
@@ -33,7 +34,7 @@ CASES = {"pendulum": ROD, "vehicle": CAR, "car": CAR}
 ROOMS = (gaps.THRESHOLDS.window_entries, 100_000)
 
 
-def certified(spec: gc.Spec) -> gc.GapFunction:
+def certified(spec: Spec) -> gc.GapFunction:
     data = {k: v for k, v in spec.data.items() if k not in ("controller", "closed_loop")}
     with tempfile.TemporaryDirectory() as folder:
         made = gc.run(data, out=folder).certificate
@@ -42,7 +43,7 @@ def certified(spec: gc.Spec) -> gc.GapFunction:
     return made.gap
 
 
-def synthesized(spec: gc.Spec, gap: gc.GapFunction) -> tuple[float, float, Any]:
+def synthesized(spec: Spec, gap: gc.GapFunction) -> tuple[float, float, Any]:
     """CPU seconds of the gap over blocks, and of the whole, the better of two; and the controller's evidence."""
     model, made = spec.build("model"), spec.build("controller")
     made.threads = 1

@@ -230,3 +230,35 @@ def test_collecting_the_tests_imports_no_engine_and_nothing_else_that_is_heavy(c
     assert len(names) > 5000
     assert {"pytest", "numpy"} <= modules
     assert {"mujoco", "pybullet", "pydrake", "dartpy", "torch"} <= HEAVY
+
+
+@cache
+def bound(path):
+    """All names that a file gives something, at whatever place."""
+    nodes = list(ast.walk(tree(path)))
+    stored = {n.id for n in nodes if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
+    return stored | {n.name for n in tree(path).body if hasattr(n, "name")} | {a.asname or a.name for a in aliases(nodes)}
+
+
+def aliases(nodes):
+    return [a for n in nodes if isinstance(n, ast.Import | ast.ImportFrom) for a in n.names]
+
+
+def test_what_benchmarks_take_from_ours_is_there():
+    """They run rarely, so that a name that has moved would be missed late."""
+    modules = rooms.files()
+    offered = rooms.offered(modules)
+
+    def has(module, name):
+        return f"{module}.{name}" in modules or name in offered.get(module, ()) or name in bound(modules[module])
+
+    lost = []
+    for path in sorted(ROOT.glob("benchmarks/**/*.py")):
+        nodes = list(ast.walk(tree(path)))
+        froms = (n for n in nodes if isinstance(n, ast.ImportFrom) and str(n.module).split(".")[0] in ("gapcert", *NAMES))
+        taken = [(node.module, a.name) for node in froms for a in node.names]
+        ours = {a.asname for a in aliases(nodes) if a.name == "gapcert" and a.asname}
+        attributes = (n for n in nodes if isinstance(n, ast.Attribute) and isinstance(n.value, ast.Name) and n.value.id in ours)
+        taken += [("gapcert", n.attr) for n in attributes]
+        lost += [(name(path), *what) for what in taken if what[0] not in modules or not has(*what)]
+    assert lost == []

@@ -61,7 +61,9 @@ def backend(file: Path, joints: Sequence[str], **options: Any) -> gapcert_engine
         "inputs": {f"u_{j}": j for j in joints},
         "period": f"{PERIOD} s",
     }
-    built: gc.EngineBackend = known.build("backend", "mujoco", config.model_validate(section | options), gc.Context())
+    built: gapcert_engines.EngineBackend = known.build(
+        "backend", "mujoco", config.model_validate(section | options), gc.Context()
+    )
     return built
 
 
