@@ -13,7 +13,7 @@ _HOME = homes(
         "gapcert.certification.certificate": "Certificate",
         "gapcert.certification.certify": "certify",
         "gapcert.certification.declared": "Declaration",
-        "gapcert.certification.gates": "HiddenPlan",
+        "gapcert.certification.gates.hidden_state": "HiddenPlan",
         "gapcert.certification.routes": "Request",
         "gapcert.certification.samples.designs": "AdaptiveSampling GridSampling LatticeSampling",
         "gapcert.contracts.controllers.control": "Controller StepInfo SynthesisProblem",

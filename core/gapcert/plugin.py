@@ -8,18 +8,18 @@ from gapcert.lazy import LazyPackage, homes
 
 _HOME = homes(
     {
-        "gapcert.certification.bounds.slope_growth": "Trails follow",
-        "gapcert.certification.bounds.supremum": "supremum",
+        "gapcert.certification.refutation": "Trails follow",
+        "gapcert.certification.supremum": "supremum",
         "gapcert.certification.certificate": (
-            "Audit Certificate Ledger Record StateEvidence domain_data gap_digest saved_digest"
+            "Audit Certificate Ledger Record StateEvidence domain_data figures gap_digest saved_digest"
         ),
         "gapcert.certification.certify": "digest",
         "gapcert.certification.compatibility": "unmatched unpaired",
         "gapcert.certification.coordinates": "Coordinates RelativeModel in_words",
         "gapcert.certification.declared": "Declaration",
-        "gapcert.certification.evidence": "figures",
-        "gapcert.certification.gates": "Gate forgets widen",
+        "gapcert.certification.gates.augment": "forgets widen",
         "gapcert.certification.gates.hidden_distribution": "Law beginning",
+        "gapcert.certification.gates.hidden_state": "Gate",
         "gapcert.certification.routes": "Findings Request Route",
         "gapcert.certification.samples.executors": "processes",
         "gapcert.certification.samples.store": "Store",

@@ -14,16 +14,15 @@ import numpy as np
 import numpy.typing as npt
 
 import gapcert
-from gapcert.certification.bounds.curvature import kinks
-from gapcert.certification.bounds.refutation import growth_warning
-from gapcert.certification.gates import Gate
+from gapcert.certification.gates.hidden_state import Gate
+from gapcert.certification.refutation import warnings
 from gapcert.contracts.gaps.claim import Claim
 from gapcert.contracts.gaps.gap import GapFunction, GapProblem
 from gapcert.contracts.gaps.lipschitz import LipschitzBound
 from gapcert.contracts.gaps.predictor import Samples
 from gapcert.contracts.plugins.presentation import Shown
 from gapcert.contracts.systems.domain import Domain
-from gapcert.contracts.systems.system import Model
+from gapcert.contracts.systems.system import Model, difference
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.atomic_files import npz_bytes, write_atomic
 from gapcert.numerics.errors import UsageError
@@ -115,6 +114,13 @@ class Audit:
         }
 
 
+def points_refute(audit: Audit, attack: Mapping[str, int], gate: Gate | None) -> bool:
+    """Does a point contradict the band: of the audit, of the further attack, or from other hidden states?"""
+    attacked = attack.get("violations", 0) > attack.get("allowed", 0)
+    moved = gate is not None and gate.attack.get("violations", 0) > 0
+    return audit.refutes or attacked or moved
+
+
 @final
 @dataclass(frozen=True)
 class StateEvidence:
@@ -137,6 +143,50 @@ class StateEvidence:
 
     def summary(self) -> dict[str, Any]:
         return {k: v for k, v in vars(self).items() if v is not None}
+
+
+def figures(
+    gap: GapFunction, problem: GapProblem, model: Model, z: Array, r: Array, constant: Array, envelope: Array | None = None
+) -> dict[str, StateEvidence]:
+    """By name of the state: z (n, nz), r (n, nx); constant, envelope (nx,): the constant bound, and the envelope's mean."""
+    gamma, mean_gap = gap.gamma(z), np.abs(r).mean(axis=0)
+    x, u = problem.domain.split(z)
+    still = np.abs(difference(model.states, model.step(x, u).x, x) + r).mean(axis=0)
+    power = overpowered(gamma, model, problem.domain, z)
+    out = {}
+    for i, state in enumerate(model.states):
+        resolved = bool(mean_gap[i] >= 10 * problem.arithmetic[i])
+        mean = float(gamma[:, i].mean())
+        out[state.name] = StateEvidence(
+            gap_mean=float(mean_gap[i]),
+            gamma_mean=mean,
+            gamma_max=float(gamma[:, i].max()),
+            constant_bound=float(constant[i]),
+            safety_factor=problem.lipschitz.safety,
+            resolved=resolved,
+            vacuous=resolved and bool(mean > constant[i] * (1 + 1e-9) or mean >= still[i]),
+            envelope_mean=None if envelope is None else float(envelope[i]),
+            tightness=mean / float(mean_gap[i]) if resolved else None,
+            tightness_vs_envelope=None if envelope is None or not resolved else mean / float(envelope[i]),
+            overpowered=power[i],
+        )
+    return out
+
+
+def overpowered(gamma: Array, model: Model, domain: Domain, z: Array) -> list[float | None]:
+    """Per state, the share of points where γ_i exceeds half the range of f_i over U's corners, or over what relations leave of
+    the way there from the point's own input; None where f_i ignores u.
+    """
+    if not model.nu:
+        return [None] * model.nx
+    x, _ = domain.split(z)
+    corners = np.stack(np.meshgrid(*zip(domain.inputs.low, domain.inputs.high, strict=True)), axis=-1).reshape(-1, model.nu)
+    ends = [domain.reach(z, np.hstack([x, np.broadcast_to(c, (len(x), model.nu))])) for c in corners]
+    images = np.stack([model.step(*domain.split(end)).x for end in ends])
+    span = np.ptp(images, axis=0)
+    # A range at rounding level means that the input does not reach the state within one step.
+    moved = span.max(axis=0) > 1e-12 * np.maximum(np.abs(images).max(axis=(0, 1)), 1e-300)
+    return [float((gamma[:, i] > span[:, i] / 2).mean()) if moved[i] else None for i in range(gamma.shape[1])]
 
 
 class Record(ABC):
@@ -204,9 +254,7 @@ class Certificate(Shown):
     @property
     def holds(self) -> bool:
         """No audited or attacked point refutes the claim."""
-        moved = self.gate.attack.get("violations", 0) if self.gate is not None else 0
-        attacked = self.attack.get("violations", 0) > self.attack.get("allowed", 0)
-        return not self.audit.refutes and not attacked and moved == 0
+        return not points_refute(self.audit, self.attack, self.gate)
 
     @property
     def vacuous(self) -> bool:
@@ -267,11 +315,9 @@ class Certificate(Shown):
             out["attack"] = dict(self.attack)
         if (witness := a.witness(self.gap)) is not None:
             out["audit"]["witness"] = witness | {"at": {a.name: v for a, v in zip(self.domain.axes, witness["z"], strict=True)}}
-        growing = growth_warning(self.lipschitz, self.domain.axes)
-        said = [w for w in (growing, kinks(self.lipschitz)) if w]
-        warnings = [*(self.gate.warnings if self.gate is not None else ()), *said]
+        said = [*(self.gate.warnings if self.gate is not None else ()), *warnings(self.lipschitz, self.domain.axes)]
         hidden = self.gate.summary() if self.gate is not None else None
-        out |= {k: v for k, v in (("hidden", hidden), ("warnings", warnings)) if v}
+        out |= {k: v for k, v in (("hidden", hidden), ("warnings", said)) if v}
         return out
 
     def save(self, folder: Path) -> None:

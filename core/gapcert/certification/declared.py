@@ -13,8 +13,8 @@ from typing import Any, final
 import numpy as np
 
 import gapcert
-from gapcert.certification.assumptions import declaration, scope
 from gapcert.certification.certificate import domain_data
+from gapcert.certification.routes import declaration, scope
 from gapcert.contracts.data.recording import Recording
 from gapcert.contracts.gaps.claim import Claim
 from gapcert.contracts.gaps.gap import GapFunction
