@@ -29,9 +29,8 @@ from gapcert.certification.samples.store import Store
 from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.gaps.claim import Claim, audit_size
 from gapcert.contracts.gaps.gap import GapFamily, GapFunction, GapProblem
-from gapcert.contracts.gaps.lipschitz import LipschitzEstimator, LipschitzProblem, Residual
+from gapcert.contracts.gaps.lipschitz import LipschitzEstimator, LipschitzProblem, Residual, Symmetry
 from gapcert.contracts.gaps.predictor import AffinePredictor, ModelPredictor, Predictor, Samples
-from gapcert.contracts.gaps.symmetry import checked
 from gapcert.contracts.plugins.events import Emit, Event, Pulse, silent
 from gapcert.contracts.plugins.registry import registry
 from gapcert.contracts.systems.domain import Domain, Points
@@ -151,7 +150,7 @@ def measure(question: Question, store: Store, gate: Gate) -> GapProblem:
     none = AffinePredictor.none(domain.nx, len(domain.low))
     pairs = entry.paired(store, gate)
     asked = LipschitzProblem(domain, none, e, query, residual.model, residual.backend, seed, pairs, rounding)
-    symmetry = checked(symmetries, asked) if symmetries else None
+    symmetry = Symmetry.checked(symmetries, asked) if symmetries else None
     held = () if symmetry is None else symmetry.axes
     sampling = sampling.holding(held)
     samples = store.samples("bound-0", sampling.first(domain), sampling.kept(domain))
