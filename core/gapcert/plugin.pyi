@@ -144,7 +144,9 @@ from gapcert.numerics.constraint_zone import lattice as lattice
 from gapcert.numerics.counter_rng import keys as keys
 from gapcert.numerics.counter_rng import normals as normals
 from gapcert.numerics.counter_rng import uniforms as uniforms
+from gapcert.numerics.digest import identity as identity
 from gapcert.numerics.digest import json_digest as json_digest
+from gapcert.numerics.digest import located as located
 from gapcert.numerics.errors import GapcertError as GapcertError
 from gapcert.numerics.errors import MissingDependency as MissingDependency
 from gapcert.numerics.errors import NoStart as NoStart
@@ -153,8 +155,6 @@ from gapcert.numerics.errors import Undecided as Undecided
 from gapcert.numerics.errors import UsageError as UsageError
 from gapcert.numerics.errors import clipped as clipped
 from gapcert.numerics.errors import harmless as harmless
-from gapcert.numerics.identities import identity as identity
-from gapcert.numerics.identities import located as located
 from gapcert.numerics.interpolation import cells as cells
 from gapcert.numerics.interpolation import cut as cut
 from gapcert.numerics.interpolation import highest as highest

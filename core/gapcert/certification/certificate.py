@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
-import numpy.typing as npt
 
 import gapcert
 from gapcert.certification.gates.hidden_state import Gate
@@ -23,7 +22,7 @@ from gapcert.contracts.gaps.predictor import Samples
 from gapcert.contracts.plugins.presentation import Shown
 from gapcert.contracts.systems.domain import Domain
 from gapcert.contracts.systems.system import Model, difference
-from gapcert.numerics.arrays import Array
+from gapcert.numerics.arrays import Array, Bools
 from gapcert.numerics.atomic_files import npz_bytes, write_atomic
 from gapcert.numerics.errors import UsageError
 
@@ -83,8 +82,8 @@ class Audit:
     k: int
     epsilon: float
     beta: float
-    outside: npt.NDArray[np.bool_]
-    above: npt.NDArray[np.bool_]
+    outside: Bools
+    above: Bools
     limit: int = 0
 
     @property

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 
 from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.gaps.gap import GapFunction, GapProblem
@@ -16,17 +15,15 @@ from gapcert.contracts.gaps.predictor import Samples
 from gapcert.contracts.plugins.events import Emit, Event, silent
 from gapcert.contracts.systems.domain import Domain
 from gapcert.contracts.systems.system import StateSpec
-from gapcert.numerics.arrays import Array, Bools
+from gapcert.numerics.arrays import Array, Bools, Ints
 from gapcert.numerics.interpolation import on_curvature
 from gapcert.numerics.order_statistics import NO_CONSTANTS
-
-Index = npt.NDArray[np.intp]
 
 _PAIRS = 1_000_000  # that are looked at together
 ADVICE = "use lipschitz.residual: {kind: piecewise}"
 
 
-def contradiction(problem: GapProblem, most: int = 2_000, suspects: Index | None = None) -> dict[str, Any] | None:
+def contradiction(problem: GapProblem, most: int = 2_000, suspects: Ints | None = None) -> dict[str, Any] | None:
     """Two samples with |g_i − g′_i| > Σ_j L_ij |z_j − z′_j| + J_i + 2 e_i, which refute the constants; None if there are none.
 
     All pairs of up to `most` samples are looked at (an even selection of them where there are more), of each closed cell where
@@ -111,7 +108,7 @@ class Trails:
 
     z: Array
     g: Array
-    state: Index
+    state: Ints
     slope: Array
     settled: Bools
     queried: int
@@ -122,7 +119,7 @@ class Trails:
         return np.asarray(np.abs(self.g[:, 1] - self.g[:, 0]))
 
     @property
-    def steps(self) -> Index:
+    def steps(self) -> Ints:
         """(n,) how often each was shortened by four."""
         return np.asarray(np.isfinite(self.slope).sum(axis=1) - 1)
 
@@ -139,9 +136,9 @@ def follow(
     query: Callable[[int, Array], Array],
     z: Array,
     g: Array,
-    state: Index,
+    state: Ints,
     noise: Array,
-    steps: int | Index,
+    steps: int | Ints,
     enough: Array | None = None,
 ) -> Trails:
     """Cut segments z (n, 2, nz) with remainders g (n, 2, nx) in four and go on with the quarter in which g_state changes most.
@@ -208,7 +205,7 @@ def watched(
     return bound
 
 
-def steepest(z: Array, g: Array, constants: Array, most: int = 4) -> tuple[Array, Index]:
+def steepest(z: Array, g: Array, constants: Array, most: int = 4) -> tuple[Array, Ints]:
     """Segments (n, 2, nz) and their states (n,): per state the pairs of samples that use most of what the constants allow."""
     upper = np.triu_indices(len(z), 1)
     apart = np.abs(z[upper[0]] - z[upper[1]])
@@ -222,7 +219,7 @@ def steepest(z: Array, g: Array, constants: Array, most: int = 4) -> tuple[Array
     return np.array(segments).reshape(-1, 2, z.shape[1]), np.array(states, dtype=np.intp)
 
 
-def along_axes(segments: Array, domain: Domain) -> tuple[Array, Index]:
+def along_axes(segments: Array, domain: Domain) -> tuple[Array, Ints]:
     """Each segment (n, 2, nz) as the steps of a staircase, one axis after the other: (m, 2, nz), and whose each step is."""
     steps, owner = [], []
     for k, (a, b) in enumerate(segments):
@@ -238,7 +235,7 @@ def along_axes(segments: Array, domain: Domain) -> tuple[Array, Index]:
 
 
 def growth(
-    remainder: Callable[[str, Array], Array], domain: Domain, segments: Array, state: Index, noise: Array, steps: int = 8
+    remainder: Callable[[str, Array], Array], domain: Domain, segments: Array, state: Ints, noise: Array, steps: int = 8
 ) -> tuple[dict[str, Any] | None, int]:
     """The largest jump on the way from one end of a segment to the other, or None where all settled, and transitions spent.
 

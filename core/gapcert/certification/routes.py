@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 
 from gapcert.certification.certificate import Audit, Ledger, Record
 from gapcert.certification.coordinates import in_words
@@ -24,7 +23,7 @@ from gapcert.contracts.plugins.events import Pulse
 from gapcert.contracts.plugins.registry import registry
 from gapcert.contracts.systems.domain import Domain
 from gapcert.contracts.systems.system import Model, System
-from gapcert.numerics.arrays import Array
+from gapcert.numerics.arrays import Array, Ints
 from gapcert.numerics.errors import UsageError
 from gapcert.numerics.interpolation import on_curvature
 
@@ -208,7 +207,7 @@ class Declared(_Audited):
         )
 
 
-def undershoot(gap: GapFunction, samples: Samples) -> npt.NDArray[np.intp]:
+def undershoot(gap: GapFunction, samples: Samples) -> Ints:
     """Samples (by number) with |r| > γ: a plugin's claim is data, and data are checked."""
     blocks = range(0, len(samples), 100_000)
     low = [np.any(np.abs(samples.r[a : a + 100_000]) > gap.gamma(samples.z[a : a + 100_000]), axis=1) for a in blocks]

@@ -11,12 +11,11 @@ from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 
 from gapcert.certification.gates.hidden_probes import Pool, Range, columns
 from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.systems.system import Backend, Model, System, difference
-from gapcert.numerics.arrays import Array
+from gapcert.numerics.arrays import Array, Bools, Ints
 from gapcert.numerics.counter_rng import Keys, keys, uniforms
 from gapcert.numerics.digest import json_digest
 from gapcert.numerics.errors import UsageError
@@ -34,7 +33,7 @@ class Law(ABC):
         """About `count` alternatives (n, nh) at the same x, which span the distribution's support."""
 
     @abstractmethod
-    def outside(self, hidden: Array) -> npt.NDArray[np.bool_]:
+    def outside(self, hidden: Array) -> Bools:
         """(n,): which hidden states certainly lie outside what draws can reach, since they leave its box."""
 
     @abstractmethod
@@ -90,7 +89,7 @@ class Ranges(Law):
             out.append(h)
         return out
 
-    def outside(self, hidden: Array) -> npt.NDArray[np.bool_]:
+    def outside(self, hidden: Array) -> Bools:
         h = hidden[:, self.index]
         return np.asarray(((h < self.low) | (h > self.high)).any(axis=1))
 
@@ -122,7 +121,7 @@ class Visited(Law):
         self.scale = np.where(counts, 1 / width, 0.0)
         self.low, self.high = pool.h.min(axis=0), pool.h.max(axis=0)
 
-    def nearest(self, x: Array) -> npt.NDArray[np.intp]:
+    def nearest(self, x: Array) -> Ints:
         """(n, near): which visited states are closest."""
         from scipy.spatial import cKDTree
 
@@ -138,7 +137,7 @@ class Visited(Law):
         index = self.nearest(x)
         return [self.pool.h[index[:, k]] for k in range(self.near)]
 
-    def outside(self, hidden: Array) -> npt.NDArray[np.bool_]:
+    def outside(self, hidden: Array) -> Bools:
         return np.asarray(((hidden < self.low) | (hidden > self.high)).any(axis=1))
 
     def describe(self) -> str:

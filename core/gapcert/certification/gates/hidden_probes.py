@@ -8,12 +8,11 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
-import numpy.typing as npt
 
 from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.systems.domain import Domain
 from gapcert.contracts.systems.system import StateSpec, System, difference, rotated
-from gapcert.numerics.arrays import Array
+from gapcert.numerics.arrays import Array, Bools
 
 Range = tuple[float, float]
 
@@ -95,7 +94,7 @@ def visited(
     return Pool(np.concatenate(xs), np.concatenate(hs))
 
 
-def inputs(domain: Domain, x: Array, rng: np.random.Generator) -> tuple[Array, npt.NDArray[np.bool_]]:
+def inputs(domain: Domain, x: Array, rng: np.random.Generator) -> tuple[Array, Bools]:
     """u (n, nu) with (x, u) in the domain, and where there is one: the first that fits of 64 uniform ones per row."""
     low, width = domain.low[domain.nx :], domain.width[domain.nx :]
     tried = low + width * rng.random((len(x), THRESHOLDS.hidden_candidates, len(low)))

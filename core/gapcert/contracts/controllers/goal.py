@@ -9,7 +9,7 @@ from typing import Any, Literal, final, get_args
 import numpy as np
 
 from gapcert.contracts.systems.domain import Box, Domain
-from gapcert.contracts.systems.region import Region, bounds_of, box_of, turned
+from gapcert.contracts.systems.region import Region, turned
 from gapcert.contracts.systems.system import StateSpec
 from gapcert.numerics.arrays import Array, Bools, Ints
 from gapcert.numerics.errors import UsageError
@@ -145,7 +145,7 @@ class Goal:
         data: dict[str, Any] = {
             "kind": self.kind,
             "axes": [[a.name, a.unit, a.kind] for a in self.stay.axes],
-            "stay": bounds_of(self.stay),
+            "stay": self.stay.bounds,
         }
         regions = {"target": self.target, "avoid": self.avoid}
         data |= {name: region.to_data() for name, region in regions.items() if region is not None}
@@ -162,7 +162,7 @@ class Goal:
 
         automaton = Automaton.from_data(data["automaton"]) if "automaton" in data else None
         regions = tuple(Region.from_data(axes, r) for r in data.get("regions", ()))
-        return cls(data["kind"], box_of(axes, data["stay"]), region("target"), region("avoid"), automaton, regions)
+        return cls(data["kind"], Box.of(axes, data["stay"]), region("target"), region("avoid"), automaton, regions)
 
 
 def _inside(name: str, inner: Box, frame: str, outer: Box) -> None:

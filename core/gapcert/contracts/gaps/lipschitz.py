@@ -17,7 +17,7 @@ from gapcert.contracts.thresholds import THRESHOLDS
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.errors import UsageError
 from gapcert.numerics.interpolation import worst
-from gapcert.numerics.intervals import Interval
+from gapcert.numerics.intervals import norm
 
 Provenance = Literal["analytic", "interval", "declared", "estimated"]
 
@@ -118,12 +118,7 @@ class LipschitzBound:
 
     def joint(self, columns: slice) -> Array:
         """(nx,) Euclidean constant over a block of axes: |Δg_i| ≤ ‖L_i,block‖₂ ‖Δz_block‖₂ (Cauchy–Schwarz), rounded up."""
-        v = Interval.exact(self.value[:, columns])
-        square = (v * v).hi
-        total = np.zeros(len(square))
-        for j in range(square.shape[1]):
-            total = np.nextafter(total + square[:, j], np.inf)
-        return np.asarray(np.nextafter(np.sqrt(total), np.inf))
+        return norm(self.value[:, columns])
 
 
 @final
