@@ -18,7 +18,7 @@ from gapcert.contracts.gaps.gap import GapFunction as GapFunction
 from gapcert.contracts.plugins.component import Component as Component
 from gapcert.contracts.plugins.component import Context as Context
 from gapcert.contracts.plugins.events import Event as Event
-from gapcert.contracts.plugins.hooks import hookimpl as hookimpl
+from gapcert.contracts.plugins.registry import hookimpl as hookimpl
 from gapcert.contracts.plugins.registry import registry as registry
 from gapcert.contracts.systems.domain import Box as Box
 from gapcert.contracts.systems.domain import Domain as Domain

@@ -86,7 +86,6 @@ from gapcert.contracts.plugins.events import Event as Event
 from gapcert.contracts.plugins.events import Pulse as Pulse
 from gapcert.contracts.plugins.events import Stages as Stages
 from gapcert.contracts.plugins.events import silent as silent
-from gapcert.contracts.plugins.hooks import hookimpl as hookimpl
 from gapcert.contracts.plugins.options import ConfigContract as ConfigContract
 from gapcert.contracts.plugins.options import Keyed as Keyed
 from gapcert.contracts.plugins.options import of_config as of_config
@@ -94,6 +93,7 @@ from gapcert.contracts.plugins.presentation import Shown as Shown
 from gapcert.contracts.plugins.presentation import View as View
 from gapcert.contracts.plugins.presentation import view as view
 from gapcert.contracts.plugins.registry import Registry as Registry
+from gapcert.contracts.plugins.registry import hookimpl as hookimpl
 from gapcert.contracts.plugins.registry import registry as registry
 from gapcert.contracts.systems.cells import Cells as Cells
 from gapcert.contracts.systems.domain import Box as Box

@@ -220,9 +220,48 @@ class Record(ABC):
         """What `gapcert verify` needs besides the samples, named as in `certificate.npz`."""
 
 
+class Statement(Shown, ABC):
+    """γ as something is said of it, by a certificate or by a person: asked, held against measurements, and saved."""
+
+    gap: GapFunction
+    versions: Mapping[str, str]
+
+    @abstractmethod
+    def summary(self) -> dict[str, Any]:
+        """The `certificate` object of the JSON contract."""
+
+    def gamma(self, x: Array, u: Array) -> Array:
+        """γ(x, u): x (n, nx) or (nx,), u (n, nu) or (nu,) → (n, nx)."""
+        z = np.concatenate([np.atleast_2d(np.asarray(x, dtype=float)), np.atleast_2d(np.asarray(u, dtype=float))], axis=1)
+        return self.gap.gamma(z)
+
+    def check(self: Any, recording: Recording, noise: Mapping[str, float] | None = None) -> Any:
+        """New measurements against γ, as a `Check`; noise: by how much channels may err, in the model's units."""
+        return gapcert.check(gapcert.Certified.of(self), recording, noise)
+
+    def monitor(self: Any) -> Any:
+        """γ watched online, one transition at a time: a `Monitor`."""
+        return gapcert.Monitor(gapcert.Certified.of(self))
+
+    def _write(self, folder: Path, domain: Domain, predictor: str, arrays: Mapping[str, Array], **more: Any) -> None:
+        """`certificate.json`, the summary and `more`, and `certificate.npz`, γ's own arrays and others."""
+        content = npz_bytes({**{f"gap.{k}": v for k, v in self.gap.arrays().items()}, **arrays})
+        data = {
+            **self.summary(),
+            "form": dict(self.gap.form),
+            "predictor": predictor,
+            "domain": domain_data(domain),
+            "arrays": hashlib.sha256(content).hexdigest(),
+            "versions": dict(self.versions),
+            **more,
+        }
+        write_atomic(folder / "certificate.npz", content)
+        write_atomic(folder / "certificate.json", json.dumps(data, indent=1, sort_keys=True).encode())
+
+
 @final
 @dataclass(frozen=True, repr=False)
-class Certificate(Shown):
+class Certificate(Statement):
     """γ with l ≤ r ≤ u, what that rests on, and the evidence."""
 
     gap: GapFunction
@@ -270,19 +309,6 @@ class Certificate(Shown):
             return f"the gap function holds at level {level}: {made.reason(self.audit)}"
         return f"the gap function holds at level {level}: {n} audited points without a violation"
 
-    def gamma(self, x: Array, u: Array) -> Array:
-        """γ(x, u): x (n, nx) or (nx,), u (n, nu) or (nu,) → (n, nx)."""
-        z = np.concatenate([np.atleast_2d(np.asarray(x, dtype=float)), np.atleast_2d(np.asarray(u, dtype=float))], axis=1)
-        return self.gap.gamma(z)
-
-    def check(self, recording: Recording, noise: Mapping[str, float] | None = None) -> Any:
-        """New measurements against γ, as a `Check`; noise: by how much channels may err, in the model's units."""
-        return gapcert.check(gapcert.Certified.of(self), recording, noise)
-
-    def monitor(self) -> Any:
-        """γ watched online, one transition at a time: a `Monitor`."""
-        return gapcert.Monitor(gapcert.Certified.of(self))
-
     def summary(self) -> dict[str, Any]:
         """The `certificate` object of the JSON contract."""
         a = self.audit
@@ -322,8 +348,7 @@ class Certificate(Shown):
     def save(self, folder: Path) -> None:
         """Write `certificate.json` and `certificate.npz`; the samples stay in their shards, named here with their digests."""
         p = self.problem
-        arrays = {f"gap.{k}": v for k, v in self.gap.arrays().items()}
-        arrays |= {f"predictor.{k}": v for k, v in p.predictor.arrays().items()}
+        arrays = {f"predictor.{k}": v for k, v in p.predictor.arrays().items()}
         arrays |= {"lipschitz": p.lipschitz.value, "resolution": p.resolution, "remainder.resolution": p.remainder_resolution}
         arrays |= {} if p.lipschitz.cells is None else p.lipschitz.cells.arrays()
         arrays |= {} if p.rounding is None else {"rounding": p.rounding}
@@ -334,21 +359,16 @@ class Certificate(Shown):
         arrays |= {} if self.calibration is None else self.calibration.arrays(p)
         if p.predictor.kind == "model":
             arrays["predictor.samples"] = p.predictor(p.samples.z)
-        content = npz_bytes(arrays)
-        write_atomic(folder / "certificate.npz", content)
-        data = {
-            **self.summary(),
-            "form": dict(self.gap.form),
-            "predictor": p.predictor.kind,
-            "domain": domain_data(p.domain),
-            "symmetry": None if p.symmetry is None else p.symmetry.to_data(),
-            "cover": list(p.samples.cover.counts) if p.samples.cover else None,
-            "seed": p.seed,
-            "digests": dict(self.digests),
-            "arrays": hashlib.sha256(content).hexdigest(),
-            "versions": dict(self.versions),
-        }
-        write_atomic(folder / "certificate.json", json.dumps(data, indent=1, sort_keys=True).encode())
+        self._write(
+            folder,
+            p.domain,
+            p.predictor.kind,
+            arrays,
+            symmetry=None if p.symmetry is None else p.symmetry.to_data(),
+            cover=list(p.samples.cover.counts) if p.samples.cover else None,
+            seed=p.seed,
+            digests=dict(self.digests),
+        )
 
 
 def domain_data(domain: Domain) -> dict[str, Any]:

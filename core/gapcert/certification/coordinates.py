@@ -12,6 +12,7 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert.contracts.data.inequality import substitution
 from gapcert.contracts.gaps.gap import GapFunction
 from gapcert.contracts.gaps.predictor import Predictor
 from gapcert.contracts.systems.domain import Box, Domain, Relation
@@ -38,8 +39,6 @@ class Coordinates:
     @classmethod
     def of(cls, system: System, given: Mapping[str, str]) -> Coordinates:
         """From texts such as `{dx: ux - vx}`: one for each input, each a sum of that input and of states."""
-        from gapcert.contracts.data.inequality import substitution
-
         states, inputs = ({a.name: a.unit for a in axes} for axes in (system.states, system.inputs))
         found, faults = substitution(given, states, inputs)
         for name, error in faults[:1]:

@@ -191,7 +191,7 @@ def watched(
         return bound
     pick = np.linspace(0, len(samples) - 1, min(among, len(samples))).astype(int)
     z = samples.z[pick]
-    segments, state = steepest(z, samples.r[pick] - problem.predictor(z), bound.value)
+    segments, state = _steepest(z, samples.r[pick] - problem.predictor(z), bound.value)
     if bound.steep is not None:
         nx, k = bound.steep.shape[:2]
         segments = np.concatenate([segments, bound.steep.reshape(nx * k, 2, -1)])
@@ -205,7 +205,7 @@ def watched(
     return bound
 
 
-def steepest(z: Array, g: Array, constants: Array, most: int = 4) -> tuple[Array, Ints]:
+def _steepest(z: Array, g: Array, constants: Array, most: int = 4) -> tuple[Array, Ints]:
     """Segments (n, 2, nz) and their states (n,): per state the pairs of samples that use most of what the constants allow."""
     upper = np.triu_indices(len(z), 1)
     apart = np.abs(z[upper[0]] - z[upper[1]])
@@ -219,7 +219,7 @@ def steepest(z: Array, g: Array, constants: Array, most: int = 4) -> tuple[Array
     return np.array(segments).reshape(-1, 2, z.shape[1]), np.array(states, dtype=np.intp)
 
 
-def along_axes(segments: Array, domain: Domain) -> tuple[Array, Ints]:
+def _along_axes(segments: Array, domain: Domain) -> tuple[Array, Ints]:
     """Each segment (n, 2, nz) as the steps of a staircase, one axis after the other: (m, 2, nz), and whose each step is."""
     steps, owner = [], []
     for k, (a, b) in enumerate(segments):
@@ -241,7 +241,7 @@ def growth(
 
     remainder(name, z) returns g; every segment is followed for its own state along each of the axes that it crosses.
     """
-    stairs, owner = along_axes(segments, domain)
+    stairs, owner = _along_axes(segments, domain)
     if not len(stairs):
         return None, 0
     ends = remainder("growth-ends", stairs.reshape(-1, stairs.shape[2])).reshape(len(stairs), 2, -1)

@@ -120,7 +120,7 @@ class _Audited(Route):
     def sentences(self, found: Findings) -> list[str]:
         problem, gap, names = found.problem, found.gap, [s.name for s in found.model.states]
         said = [self.refutation(problem, found.refuted, names)] if found.refuted is not None else []
-        probed = assumptions(self.basis(problem, gap, names), problem, found.audit, found.model, found.gate)
+        probed = _assumptions(self.basis(problem, gap, names), problem, found.audit, found.model, found.gate)
         return [*curvature_sentences(problem, gap), *probed, *self.rest(problem), *said]
 
 
@@ -142,7 +142,7 @@ class _Bounded(_Audited):
         return found
 
     def basis(self, problem: GapProblem, gap: GapFunction, states: Sequence[str]) -> list[str]:
-        return origin(problem)
+        return _origin(problem)
 
     def refutation(self, problem: GapProblem, refuted: Refuted, states: Sequence[str]) -> str:
         return f"REFUTED: two samples contradict the constants of {states[refuted['state']]} by {refuted['excess']:.3g}."
@@ -219,7 +219,7 @@ def _envelope(gap: GapFunction, problem: GapProblem) -> GapFunction:
     return made
 
 
-def assumptions(basis: Sequence[str], problem: GapProblem, audited: Audit, model: Model, gate: Gate) -> list[str]:
+def _assumptions(basis: Sequence[str], problem: GapProblem, audited: Audit, model: Model, gate: Gate) -> list[str]:
     """What the claim rests on, one sentence each, with provenance; `basis` is what γ itself does."""
     names = [s.name for s in model.states]
     return [
@@ -236,7 +236,7 @@ def assumptions(basis: Sequence[str], problem: GapProblem, audited: Audit, model
     ]
 
 
-def origin(problem: GapProblem) -> list[str]:
+def _origin(problem: GapProblem) -> list[str]:
     """Whence the constants are, and where they jump."""
     bound, p = problem.lipschitz, problem.predictor
     what = "r" if p.kind == "none" else f"r − p (p: {p.kind} predictor)"
@@ -259,12 +259,9 @@ def declaration(gap: GapFunction, states: Sequence[str], domain: Domain) -> str:
 
 def scope(model: Model, domain: Domain) -> str:
     """What a claim is about."""
+    texts = ", ".join(dict.fromkeys(r.text for r in domain.relations))
+    zone = f"X × U with {texts}" if texts else "X × U"
     return (
-        f"The claim is about one period of {model.period:g} s with the input held, on Z = {_zone(domain)}; "
+        f"The claim is about one period of {model.period:g} s with the input held, on Z = {zone}; "
         f"what happens between samples and outside Z is not covered. X × U: {in_words(model, domain)}."
     )
-
-
-def _zone(domain: Domain) -> str:
-    texts = ", ".join(dict.fromkeys(r.text for r in domain.relations))
-    return f"X × U with {texts}" if texts else "X × U"

@@ -129,9 +129,8 @@ def highest(axes: Axes, values: Array, low: Array, high: Array, slope: Array) ->
     return out
 
 
-def slopes(axes: Axes, values: Array, low: Array, high: Array, closed: bool = True) -> tuple[Array, Array]:
-    """The least and the largest slope along each axis over closed boxes, (n, nx, nz); those of difference quotients inside the
-    boxes unless `closed`."""
+def slopes(axes: Axes, values: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """The least and the largest slope along each axis over closed boxes, (n, nx, nz)."""
     nz = len(axes)
     out = np.zeros((2, len(low), values.shape[-1], nz))
 
@@ -144,7 +143,7 @@ def slopes(axes: Axes, values: Array, low: Array, high: Array, closed: bool = Tr
             inner = tuple(range(1, part.ndim - 1))
             out[0, rows, :, j], out[1, rows, :, j] = part.min(axis=inner), part.max(axis=inner)
 
-    _by_size(axes, values, *cells(axes, low, high, closed), write)
+    _by_size(axes, values, *cells(axes, low, high, closed=True), write)
     return out[0], out[1]
 
 

@@ -11,7 +11,7 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.certification.gates.hidden_probes import columns, default
+from gapcert.certification.gates.hidden_distribution import columns, default
 from gapcert.contracts.systems.domain import Domain
 from gapcert.contracts.systems.scene import Scene
 from gapcert.contracts.systems.system import Backend, Extension, Model, StateSpec, Step, System, difference

@@ -13,7 +13,7 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.certification.gates.hidden_probes import moved
+from gapcert.certification.gates.hidden_distribution import moved
 from gapcert.certification.samples.executors import processes
 from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.systems.domain import Domain

@@ -102,7 +102,7 @@ class Cells:
         scale = np.maximum(np.abs(r).mean(axis=0), np.finfo(float).tiny)
         weights = (self.constants / scale[:, None]).sum(axis=1)
         boxes = self.boxes
-        heap = [_entry(k, c, boxes.mid[k], boxes.rad[k], weights[c]) for k, c in enumerate(range(len(self)))]
+        heap = [_entry(c, c, boxes.mid[c], boxes.rad[c], weights[c]) for c in range(len(self))]
         heapq.heapify(heap)
         points = list(self.anchors)
         age, most = len(heap), len(points) + budget

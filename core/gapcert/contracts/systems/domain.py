@@ -10,6 +10,7 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert.contracts.data.inequality import MalformedError, parse
 from gapcert.contracts.systems.system import StateSpec, System
 from gapcert.numerics.arrays import Array, Bools, Ints
 from gapcert.numerics.constraint_zone import Relation as Relation
@@ -189,8 +190,6 @@ class Domain:
 
 
 def _relations(given: Iterable[str | Relation], units: Mapping[str, str]) -> Iterable[Relation]:
-    from gapcert.contracts.data.inequality import MalformedError, parse
-
     for item in given:
         if isinstance(item, Relation):
             yield item
