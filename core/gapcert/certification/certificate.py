@@ -235,6 +235,7 @@ class Statement(Shown, ABC):
         z = np.concatenate([np.atleast_2d(np.asarray(x, dtype=float)), np.atleast_2d(np.asarray(u, dtype=float))], axis=1)
         return self.gap.gamma(z)
 
+    # `Certified.of` takes a Certificate or a Declaration, and types know no class that has no other subclasses: hence Any.
     def check(self: Any, recording: Recording, noise: Mapping[str, float] | None = None) -> Any:
         """New measurements against γ, as a `Check`; noise: by how much channels may err, in the model's units."""
         return gapcert.check(gapcert.Certified.of(self), recording, noise)
