@@ -51,8 +51,7 @@ AREAS = tuple(
         (
             "Probes before a certificate",
             "concepts",
-            "core/gapcert/certification/gates/ core/gapcert/contracts/gaps/symmetry.py "
-            "core/gapcert/contracts/systems/system.py",
+            "core/gapcert/certification/gates/ core/gapcert/contracts/systems/system.py",
         ),
         (
             "Controllers",

@@ -2,7 +2,7 @@ from gapcert import plugin as plugin
 from gapcert.certification.certificate import Certificate as Certificate
 from gapcert.certification.certify import certify as certify
 from gapcert.certification.declared import Declaration as Declaration
-from gapcert.certification.gates import HiddenPlan as HiddenPlan
+from gapcert.certification.gates.hidden_state import HiddenPlan as HiddenPlan
 from gapcert.certification.routes import Request as Request
 from gapcert.certification.samples.designs import AdaptiveSampling as AdaptiveSampling
 from gapcert.certification.samples.designs import GridSampling as GridSampling
@@ -18,7 +18,7 @@ from gapcert.contracts.gaps.gap import GapFunction as GapFunction
 from gapcert.contracts.plugins.component import Component as Component
 from gapcert.contracts.plugins.component import Context as Context
 from gapcert.contracts.plugins.events import Event as Event
-from gapcert.contracts.plugins.hooks import hookimpl as hookimpl
+from gapcert.contracts.plugins.registry import hookimpl as hookimpl
 from gapcert.contracts.plugins.registry import registry as registry
 from gapcert.contracts.systems.domain import Box as Box
 from gapcert.contracts.systems.domain import Domain as Domain

@@ -9,7 +9,7 @@ import pytest
 from rough_fields import Bump, Coarse
 
 import gapcert as gc
-from gapcert.certification.bounds.refutation import growth_warning
+from gapcert.certification.refutation import growth_warning
 from gapcert.certification.samples.executors import threads
 from gapcert.testing import LipschitzContract
 from gapcert_bounds.config import GradientEliteConfig

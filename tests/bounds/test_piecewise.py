@@ -10,7 +10,7 @@ import pytest
 from rough_fields import Coarse, Contact, slide
 
 import gapcert as gc
-from gapcert.certification.bounds.slope_growth import growth
+from gapcert.certification.refutation import growth
 from gapcert.contracts.systems.cells import Cells
 from gapcert.contracts.systems.domain import Relation
 from gapcert.testing import LipschitzContract

@@ -13,7 +13,7 @@ from forging import edit_json, failed
 import gapcert as gc
 import gapcert_functions
 import gapcert_networks
-from gapcert.certification.certify import Request
+from gapcert.certification.routes import Request
 from gapcert.numerics.intervals import Interval
 from gapcert.numerics.order_statistics import STREAM, points_needed, surprising
 from gapcert.testing.toys import Drift, Perturbed, ripple

@@ -14,7 +14,7 @@ import pytest
 from calibrating import TOO_LARGE, calibrated, declared, noisy
 from forging import edit_arrays, edit_json
 
-from gapcert.certification.certify import Request
+from gapcert.certification.routes import Request
 from gapcert_verify.verify import verify_run
 
 Array = np.ndarray

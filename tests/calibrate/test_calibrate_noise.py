@@ -11,7 +11,7 @@ from calibrating import RANGES, calibrated, noisy
 from forging import failed
 
 import gapcert as gc
-from gapcert.certification.certify import Request
+from gapcert.certification.routes import Request
 from gapcert.numerics.intervals import Interval
 from gapcert.numerics.order_statistics import points_needed
 from gapcert.testing.toys import Drift

@@ -12,7 +12,7 @@ from exported import POLICIES, driven, imported, offered, replayed, states
 
 from gapcert import Box, Goal, Region, StateSpec, UsageError
 from gapcert.cli.main import main
-from gapcert.contracts.controllers.automaton import Automaton
+from gapcert.contracts.controllers.goal import Automaton
 from gapcert.contracts.systems.region import Ellipsoid, Polytope
 from gapcert.numerics.constraint_zone import Relation
 from gapcert_cells import AutomatonController, GridController

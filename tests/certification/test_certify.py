@@ -9,7 +9,8 @@ import pytest
 
 import gapcert as gc
 from gapcert.certification.certificate import Ledger
-from gapcert.certification.certify import Request, _violations
+from gapcert.certification.certify import _violations
+from gapcert.certification.routes import Request
 from gapcert.certification.samples.designs import AdaptiveSampling, GridSampling
 from gapcert.contracts.gaps.claim import audit_size
 from gapcert.contracts.systems.system import Step

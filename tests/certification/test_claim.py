@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.certification.certify import Request
+from gapcert.certification.routes import Request
 from gapcert.contracts.gaps.claim import audit_size
 from gapcert.testing.toys import Drift, Perturbed, ripple
 

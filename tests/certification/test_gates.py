@@ -7,8 +7,8 @@ import pytest
 from faulty import PerProcess, Sleeping, WarmStart
 
 import gapcert as gc
+from gapcert.certification.gates.entry import responses
 from gapcert.certification.gates.purity import Queries, _same, purity
-from gapcert.certification.gates.response import responses
 from gapcert.certification.samples.executors import processes, threads
 from gapcert.contracts.gaps.lipschitz import Residual
 from gapcert.contracts.systems.system import Step

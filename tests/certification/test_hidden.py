@@ -9,11 +9,10 @@ import pytest
 from faulty import Coasting
 
 import gapcert as gc
-from gapcert.certification.certify import Request
 from gapcert.certification.gates.augment import Augmented, AugmentedModel
-from gapcert.certification.gates.hidden_distribution import HiddenDraws, Paired, Ranges, Visited
-from gapcert.certification.gates.hidden_probes import Pool, inputs, moved, visited
+from gapcert.certification.gates.hidden_distribution import HiddenDraws, Paired, Pool, Ranges, Visited, inputs, moved, visited
 from gapcert.certification.gates.hidden_state import HiddenPlan, open_gate, spread
+from gapcert.certification.routes import Request
 from gapcert.certification.samples.executors import threads
 from gapcert.numerics.intervals import Interval
 from gapcert.testing import SystemContract

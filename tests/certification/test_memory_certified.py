@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.certification.gates.memory import unmeasured
+from gapcert.certification.gates.augment import unmeasured
 
 CART = {
     "kind": "equations", "coordinates": {"q": "m"}, "inputs": {"F": "N"}, "parameters": {"mass": "2 kg"},

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gapcert as gc
-from gapcert.certification.bounds.supremum import supremum
-from gapcert.certification.certify import Request
+from gapcert.certification.routes import Request
 from gapcert.certification.samples.designs import AdaptiveSampling, GridSampling
+from gapcert.certification.supremum import supremum
 from gapcert.contracts.data.inequality import MalformedError, parse
 from gapcert.contracts.gaps.lipschitz import Residual
 from gapcert.contracts.systems.domain import Box, Cover, Domain, Relation

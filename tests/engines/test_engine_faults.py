@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import gapcert as gc
+from gapcert.certification.gates.entry import responses
 from gapcert.certification.gates.purity import purity
-from gapcert.certification.gates.response import responses
 from gapcert.certification.samples.executors import threads
 from gapcert.contracts.gaps.lipschitz import Residual
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.certification.gates.augment import AugmentedModel
-from gapcert.certification.gates.memory import Resting
+from gapcert.certification.gates.augment import AugmentedModel, Resting
 from gapcert.numerics import intervals
 from gapcert_equations.config import EquationsConfig
 from gapcert_equations.programs import jets

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gapcert import Box, Goal, Region, StateSpec
-from gapcert.contracts.controllers.automaton import Automaton
+from gapcert.contracts.controllers.goal import Automaton
 from gapcert.contracts.systems.region import Ellipsoid
 from gapcert_cells import AutomatonController, GridController
 from gapcert_figures import Axis, LoopFigure, WinningFigure

@@ -13,7 +13,7 @@ import pytest
 
 import gapcert as gc
 from gapcert.cli.main import main
-from gapcert.numerics.identities import identity, located
+from gapcert.numerics.digest import identity, located
 
 WRITTEN = Path(__file__).parents[1] / "identity"
 PACKAGES = ("gapcert", *sorted(p.name for p in (WRITTEN.parents[1] / "plugins").iterdir() if (p / "__init__.py").exists()))

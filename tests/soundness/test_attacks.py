@@ -11,8 +11,8 @@ from faulty import Coasting
 from rough_fields import Coarse
 
 import gapcert as gc
-from gapcert.certification.certify import Request
 from gapcert.certification.gates.augment import Augmented, AugmentedModel
+from gapcert.certification.routes import Request
 from gapcert.certification.samples.designs import GridSampling
 from gapcert.certification.samples.executors import threads
 from gapcert.contracts.controllers.goal import Goal

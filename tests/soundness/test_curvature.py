@@ -9,7 +9,7 @@ import pytest
 from rough_fields import Coarse
 
 import gapcert as gc
-from gapcert.certification.bounds.curvature import kinks
+from gapcert.certification.refutation import kinks
 from gapcert_bounds.constants.gradient_elite import GradientElite
 from gapcert_bounds.constants.wood_zhang import WoodZhang
 from gapcert_bounds.testing.fields import Field, Kink, Nothing, Waves, lipschitz_problem

@@ -12,8 +12,8 @@ from faulty import Coasting
 from rough_fields import Contact, slide
 
 import gapcert as gc
-from gapcert.certification.certify import Request
-from gapcert.certification.gates import HiddenPlan
+from gapcert.certification.gates.hidden_state import HiddenPlan
+from gapcert.certification.routes import Request
 from gapcert.certification.samples.executors import threads
 from gapcert.testing.toys import Drift, Perturbed, ripple
 from gapcert_bounds.constants.piecewise import Piecewise

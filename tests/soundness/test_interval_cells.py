@@ -9,7 +9,7 @@ import pytest
 from rough_fields import Bump
 
 import gapcert as gc
-from gapcert.certification.bounds.refutation import contradiction
+from gapcert.certification.refutation import contradiction
 from gapcert.contracts.gaps.predictor import Samples
 from gapcert.numerics.constraint_zone import Relation
 from gapcert_bounds.constants.lipschitz import IntervalJacobian

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.certification.bounds.curvature import second
+from gapcert.certification.refutation import curvature_contradiction
 from gapcert_bounds import MultilinearPredictor
 from gapcert_bounds.constants.interval_curvature import merged
 from gapcert_bounds.constants.lipschitz import IntervalJacobian
@@ -172,7 +172,7 @@ def fitted(problem, residual, bound, budget):
     nodes = plan.further(problem.domain, first, residual(first), bound.value, bound)
     samples = gc.plugin.Samples(nodes, residual(nodes), lattice=tuple(np.unique(c) for c in nodes.T))
     made = gc.plugin.GapProblem(samples, problem.domain, bound, problem.predictor, problem.resolution, "dominate")
-    assert second(made) is None
+    assert curvature_contradiction(made) is None
     return Multilinear("none").fit(made)
 
 

@@ -9,7 +9,7 @@ import pytest
 from rough_fields import Contact, bounce, slide, stick, stop
 
 import gapcert as gc
-from gapcert.certification.bounds.refutation import contradiction
+from gapcert.certification.refutation import contradiction
 from gapcert.certification.samples.designs import AdaptiveSampling
 from gapcert.contracts.gaps.lipschitz import Residual
 from gapcert.contracts.gaps.predictor import Samples

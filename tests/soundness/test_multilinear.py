@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from rough_fields import Bump, Coarse
 
 import gapcert as gc
-from gapcert.certification.bounds.curvature import second
+from gapcert.certification.refutation import curvature_contradiction
 from gapcert_bounds import MultilinearPredictor
 from gapcert_bounds.families.multilinear import Multilinear, MultilinearGap
 from gapcert_bounds.testing.fields import Field, Kink, Waves, gap_problem, lattice
@@ -108,11 +108,11 @@ def test_the_resolution_counts_twice():
 
 def test_nodes_refute_too_little_curvature():
     field = Parabola()
-    assert second(gap_problem(field, (5, 4, 3))) is None
-    found = second(gap_problem(field, (5, 4, 3), bent=0.9))
+    assert curvature_contradiction(gap_problem(field, (5, 4, 3))) is None
+    found = curvature_contradiction(gap_problem(field, (5, 4, 3), bent=0.9))
     assert found is not None
     assert found["state"] == 0
-    assert second(gap_problem(Coarse(field, 1e-3).field, (5, 4, 3), backend=Coarse(field, 1e-3))) is None
+    assert curvature_contradiction(gap_problem(Coarse(field, 1e-3).field, (5, 4, 3), backend=Coarse(field, 1e-3))) is None
 
 
 class Parabola(Field):
@@ -210,7 +210,7 @@ def test_curvature_in_slabs_holds_and_cannot_be_put_elsewhere():
         problem = gc.plugin.GapProblem(samples, field.domain, bound, p, e, "dominate")
         gap = Multilinear("none").fit(problem)
         low, high = gap.interval(z)
-        results.append((outside(gap, field(z), z), float((high - low).mean()), second(problem)))
+        results.append((outside(gap, field(z), z), float((high - low).mean()), curvature_contradiction(problem)))
     assert [missed for missed, _, _ in results[:2]] == [0, 0]
     assert results[0][1] < 0.5 * results[1][1]
     assert results[0][2] is None

@@ -10,7 +10,7 @@ import pytest
 from faulty import Coasting
 
 import gapcert as gc
-from gapcert.certification.certify import Request
+from gapcert.certification.routes import Request
 from gapcert.certification.samples.executors import threads
 from gapcert.contracts.gaps.predictor import Samples
 from gapcert_bounds.constants.lipschitz import Declared

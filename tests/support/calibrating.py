@@ -1,7 +1,7 @@
 """A calibrated certificate of a model that drifts, beside a backend with a ripple."""
 
 import gapcert as gc
-from gapcert.certification.certify import Request
+from gapcert.certification.routes import Request
 from gapcert.testing.toys import Drift, Perturbed, ripple
 from gapcert_calibrate.stochastic_backend import Stochastic
 

@@ -9,7 +9,7 @@ import pytest
 from forging import edit_arrays, edit_json
 
 import gapcert as gc
-from gapcert.certification.certify import Request
+from gapcert.certification.routes import Request
 from gapcert.certification.samples.designs import GridSampling
 from gapcert.testing.toys import Drift, Perturbed, ripple
 from gapcert_verify.constant_bound import _exceeds

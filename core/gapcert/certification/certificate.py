@@ -11,20 +11,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
-import numpy.typing as npt
 
 import gapcert
-from gapcert.certification.bounds.curvature import kinks
-from gapcert.certification.bounds.refutation import growth_warning
-from gapcert.certification.gates import Gate
+from gapcert.certification.gates.hidden_state import Gate
+from gapcert.certification.refutation import warnings
 from gapcert.contracts.gaps.claim import Claim
 from gapcert.contracts.gaps.gap import GapFunction, GapProblem
 from gapcert.contracts.gaps.lipschitz import LipschitzBound
 from gapcert.contracts.gaps.predictor import Samples
 from gapcert.contracts.plugins.presentation import Shown
 from gapcert.contracts.systems.domain import Domain
-from gapcert.contracts.systems.system import Model
-from gapcert.numerics.arrays import Array
+from gapcert.contracts.systems.system import Model, difference
+from gapcert.numerics.arrays import Array, Bools
 from gapcert.numerics.atomic_files import npz_bytes, write_atomic
 from gapcert.numerics.errors import UsageError
 
@@ -84,8 +82,8 @@ class Audit:
     k: int
     epsilon: float
     beta: float
-    outside: npt.NDArray[np.bool_]
-    above: npt.NDArray[np.bool_]
+    outside: Bools
+    above: Bools
     limit: int = 0
 
     @property
@@ -115,6 +113,13 @@ class Audit:
         }
 
 
+def points_refute(audit: Audit, attack: Mapping[str, int], gate: Gate | None) -> bool:
+    """Does a point contradict the band: of the audit, of the further attack, or from other hidden states?"""
+    attacked = attack.get("violations", 0) > attack.get("allowed", 0)
+    moved = gate is not None and gate.attack.get("violations", 0) > 0
+    return audit.refutes or attacked or moved
+
+
 @final
 @dataclass(frozen=True)
 class StateEvidence:
@@ -137,6 +142,50 @@ class StateEvidence:
 
     def summary(self) -> dict[str, Any]:
         return {k: v for k, v in vars(self).items() if v is not None}
+
+
+def figures(
+    gap: GapFunction, problem: GapProblem, model: Model, z: Array, r: Array, constant: Array, envelope: Array | None = None
+) -> dict[str, StateEvidence]:
+    """By name of the state: z (n, nz), r (n, nx); constant, envelope (nx,): the constant bound, and the envelope's mean."""
+    gamma, mean_gap = gap.gamma(z), np.abs(r).mean(axis=0)
+    x, u = problem.domain.split(z)
+    still = np.abs(difference(model.states, model.step(x, u).x, x) + r).mean(axis=0)
+    power = overpowered(gamma, model, problem.domain, z)
+    out = {}
+    for i, state in enumerate(model.states):
+        resolved = bool(mean_gap[i] >= 10 * problem.arithmetic[i])
+        mean = float(gamma[:, i].mean())
+        out[state.name] = StateEvidence(
+            gap_mean=float(mean_gap[i]),
+            gamma_mean=mean,
+            gamma_max=float(gamma[:, i].max()),
+            constant_bound=float(constant[i]),
+            safety_factor=problem.lipschitz.safety,
+            resolved=resolved,
+            vacuous=resolved and bool(mean > constant[i] * (1 + 1e-9) or mean >= still[i]),
+            envelope_mean=None if envelope is None else float(envelope[i]),
+            tightness=mean / float(mean_gap[i]) if resolved else None,
+            tightness_vs_envelope=None if envelope is None or not resolved else mean / float(envelope[i]),
+            overpowered=power[i],
+        )
+    return out
+
+
+def overpowered(gamma: Array, model: Model, domain: Domain, z: Array) -> list[float | None]:
+    """Per state, the share of points where γ_i exceeds half the range of f_i over U's corners, or over what relations leave of
+    the way there from the point's own input; None where f_i ignores u.
+    """
+    if not model.nu:
+        return [None] * model.nx
+    x, _ = domain.split(z)
+    corners = np.stack(np.meshgrid(*zip(domain.inputs.low, domain.inputs.high, strict=True)), axis=-1).reshape(-1, model.nu)
+    ends = [domain.reach(z, np.hstack([x, np.broadcast_to(c, (len(x), model.nu))])) for c in corners]
+    images = np.stack([model.step(*domain.split(end)).x for end in ends])
+    span = np.ptp(images, axis=0)
+    # A range at rounding level means that the input does not reach the state within one step.
+    moved = span.max(axis=0) > 1e-12 * np.maximum(np.abs(images).max(axis=(0, 1)), 1e-300)
+    return [float((gamma[:, i] > span[:, i] / 2).mean()) if moved[i] else None for i in range(gamma.shape[1])]
 
 
 class Record(ABC):
@@ -171,9 +220,49 @@ class Record(ABC):
         """What `gapcert verify` needs besides the samples, named as in `certificate.npz`."""
 
 
+class Statement(Shown, ABC):
+    """γ as something is said of it, by a certificate or by a person: asked, held against measurements, and saved."""
+
+    gap: GapFunction
+    versions: Mapping[str, str]
+
+    @abstractmethod
+    def summary(self) -> dict[str, Any]:
+        """The `certificate` object of the JSON contract."""
+
+    def gamma(self, x: Array, u: Array) -> Array:
+        """γ(x, u): x (n, nx) or (nx,), u (n, nu) or (nu,) → (n, nx)."""
+        z = np.concatenate([np.atleast_2d(np.asarray(x, dtype=float)), np.atleast_2d(np.asarray(u, dtype=float))], axis=1)
+        return self.gap.gamma(z)
+
+    # `Certified.of` takes a Certificate or a Declaration, and types know no class that has no other subclasses: hence Any.
+    def check(self: Any, recording: Recording, noise: Mapping[str, float] | None = None) -> Any:
+        """New measurements against γ, as a `Check`; noise: by how much channels may err, in the model's units."""
+        return gapcert.check(gapcert.Certified.of(self), recording, noise)
+
+    def monitor(self: Any) -> Any:
+        """γ watched online, one transition at a time: a `Monitor`."""
+        return gapcert.Monitor(gapcert.Certified.of(self))
+
+    def _write(self, folder: Path, domain: Domain, predictor: str, arrays: Mapping[str, Array], **more: Any) -> None:
+        """`certificate.json`, the summary and `more`, and `certificate.npz`, γ's own arrays and others."""
+        content = npz_bytes({**{f"gap.{k}": v for k, v in self.gap.arrays().items()}, **arrays})
+        data = {
+            **self.summary(),
+            "form": dict(self.gap.form),
+            "predictor": predictor,
+            "domain": domain_data(domain),
+            "arrays": hashlib.sha256(content).hexdigest(),
+            "versions": dict(self.versions),
+            **more,
+        }
+        write_atomic(folder / "certificate.npz", content)
+        write_atomic(folder / "certificate.json", json.dumps(data, indent=1, sort_keys=True).encode())
+
+
 @final
 @dataclass(frozen=True, repr=False)
-class Certificate(Shown):
+class Certificate(Statement):
     """γ with l ≤ r ≤ u, what that rests on, and the evidence."""
 
     gap: GapFunction
@@ -204,9 +293,7 @@ class Certificate(Shown):
     @property
     def holds(self) -> bool:
         """No audited or attacked point refutes the claim."""
-        moved = self.gate.attack.get("violations", 0) if self.gate is not None else 0
-        attacked = self.attack.get("violations", 0) > self.attack.get("allowed", 0)
-        return not self.audit.refutes and not attacked and moved == 0
+        return not points_refute(self.audit, self.attack, self.gate)
 
     @property
     def vacuous(self) -> bool:
@@ -222,19 +309,6 @@ class Certificate(Shown):
         if (made := self.calibration) is not None:
             return f"the gap function holds at level {level}: {made.reason(self.audit)}"
         return f"the gap function holds at level {level}: {n} audited points without a violation"
-
-    def gamma(self, x: Array, u: Array) -> Array:
-        """γ(x, u): x (n, nx) or (nx,), u (n, nu) or (nu,) → (n, nx)."""
-        z = np.concatenate([np.atleast_2d(np.asarray(x, dtype=float)), np.atleast_2d(np.asarray(u, dtype=float))], axis=1)
-        return self.gap.gamma(z)
-
-    def check(self, recording: Recording, noise: Mapping[str, float] | None = None) -> Any:
-        """New measurements against γ, as a `Check`; noise: by how much channels may err, in the model's units."""
-        return gapcert.check(gapcert.Certified.of(self), recording, noise)
-
-    def monitor(self) -> Any:
-        """γ watched online, one transition at a time: a `Monitor`."""
-        return gapcert.Monitor(gapcert.Certified.of(self))
 
     def summary(self) -> dict[str, Any]:
         """The `certificate` object of the JSON contract."""
@@ -267,18 +341,15 @@ class Certificate(Shown):
             out["attack"] = dict(self.attack)
         if (witness := a.witness(self.gap)) is not None:
             out["audit"]["witness"] = witness | {"at": {a.name: v for a, v in zip(self.domain.axes, witness["z"], strict=True)}}
-        growing = growth_warning(self.lipschitz, self.domain.axes)
-        said = [w for w in (growing, kinks(self.lipschitz)) if w]
-        warnings = [*(self.gate.warnings if self.gate is not None else ()), *said]
+        said = [*(self.gate.warnings if self.gate is not None else ()), *warnings(self.lipschitz, self.domain.axes)]
         hidden = self.gate.summary() if self.gate is not None else None
-        out |= {k: v for k, v in (("hidden", hidden), ("warnings", warnings)) if v}
+        out |= {k: v for k, v in (("hidden", hidden), ("warnings", said)) if v}
         return out
 
     def save(self, folder: Path) -> None:
         """Write `certificate.json` and `certificate.npz`; the samples stay in their shards, named here with their digests."""
         p = self.problem
-        arrays = {f"gap.{k}": v for k, v in self.gap.arrays().items()}
-        arrays |= {f"predictor.{k}": v for k, v in p.predictor.arrays().items()}
+        arrays = {f"predictor.{k}": v for k, v in p.predictor.arrays().items()}
         arrays |= {"lipschitz": p.lipschitz.value, "resolution": p.resolution, "remainder.resolution": p.remainder_resolution}
         arrays |= {} if p.lipschitz.cells is None else p.lipschitz.cells.arrays()
         arrays |= {} if p.rounding is None else {"rounding": p.rounding}
@@ -289,21 +360,16 @@ class Certificate(Shown):
         arrays |= {} if self.calibration is None else self.calibration.arrays(p)
         if p.predictor.kind == "model":
             arrays["predictor.samples"] = p.predictor(p.samples.z)
-        content = npz_bytes(arrays)
-        write_atomic(folder / "certificate.npz", content)
-        data = {
-            **self.summary(),
-            "form": dict(self.gap.form),
-            "predictor": p.predictor.kind,
-            "domain": domain_data(p.domain),
-            "symmetry": None if p.symmetry is None else p.symmetry.to_data(),
-            "cover": list(p.samples.cover.counts) if p.samples.cover else None,
-            "seed": p.seed,
-            "digests": dict(self.digests),
-            "arrays": hashlib.sha256(content).hexdigest(),
-            "versions": dict(self.versions),
-        }
-        write_atomic(folder / "certificate.json", json.dumps(data, indent=1, sort_keys=True).encode())
+        self._write(
+            folder,
+            p.domain,
+            p.predictor.kind,
+            arrays,
+            symmetry=None if p.symmetry is None else p.symmetry.to_data(),
+            cover=list(p.samples.cover.counts) if p.samples.cover else None,
+            seed=p.seed,
+            digests=dict(self.digests),
+        )
 
 
 def domain_data(domain: Domain) -> dict[str, Any]:

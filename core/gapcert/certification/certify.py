@@ -16,24 +16,21 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.certification import gates
-from gapcert.certification.bounds.refutation import watched
-from gapcert.certification.certificate import Audit, Certificate, Ledger, Record, gap_digest
+from gapcert.certification.certificate import Audit, Certificate, Ledger, Record, figures, gap_digest, points_refute
 from gapcert.certification.compatibility import refuse, unpaired
-from gapcert.certification.evidence import figures
-from gapcert.certification.gates import Gate, HiddenPlan
-from gapcert.certification.routes import Findings, Route
-from gapcert.certification.routes import Request as Request
-from gapcert.certification.samples.designs import AdaptiveSampling, GridSampling, LatticeSampling, Sampling, axes_of
+from gapcert.certification.gates import entry, hidden_state
+from gapcert.certification.gates.augment import widen
+from gapcert.certification.gates.hidden_state import Gate, HiddenPlan
+from gapcert.certification.refutation import watched
+from gapcert.certification.routes import Findings, Request, Route
+from gapcert.certification.samples.designs import AdaptiveSampling, GridSampling, LatticeSampling, Sampling, axes_of, refined
 from gapcert.certification.samples.executors import Kept, processes
-from gapcert.certification.samples.refinement import refined
 from gapcert.certification.samples.store import Store
 from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.gaps.claim import Claim, audit_size
 from gapcert.contracts.gaps.gap import GapFamily, GapFunction, GapProblem
-from gapcert.contracts.gaps.lipschitz import LipschitzBound, LipschitzEstimator, LipschitzProblem, Residual
+from gapcert.contracts.gaps.lipschitz import LipschitzEstimator, LipschitzProblem, Residual, Symmetry
 from gapcert.contracts.gaps.predictor import AffinePredictor, ModelPredictor, Predictor, Samples
-from gapcert.contracts.gaps.symmetry import checked
 from gapcert.contracts.plugins.events import Emit, Event, Pulse, silent
 from gapcert.contracts.plugins.registry import registry
 from gapcert.contracts.systems.domain import Domain, Points
@@ -75,40 +72,43 @@ def certify(
     file `ledger` (default: beside the folder), under the digest `question` (default: that of model, backend and domain).
     UsageError where the ingredients cannot give the claim.
     """
-    asked = Question.of(  # r = f̂ − f on Z, and what is to be claimed of it
-        model,
-        backend,
-        domain,
-        sampling=sampling,
-        lipschitz=lipschitz,
-        family=family,
-        predictor=predictor,
-        route=route,
-        request=request,
-        hidden=hidden,
-        symmetries=symmetries,
-        seed=seed,
-        question=question,
-    )
-    gate = asked.admitted(executor, emit)
-    residual = Residual(gate.system, asked.model)
+    known = registry()
+    family = family or known.build("gap_family", "envelope")
+    by: Route = known.build("route", route or family.routes[0])
+    request = request or Request(by.claim)
+    bounded = by.constants and "seed" not in backend.capabilities
+    if lipschitz is None or not by.constants:
+        lipschitz = known.build("lipschitz", "wood-zhang" if bounded else "none")
+    sampling = _sampling(sampling, family, domain, bounded)
+    p = predictor or family.predictor
+    if isinstance(p, Model):
+        p, _ = widen(p, backend, domain)
+    entry.contain(model, domain)
+    model, backend = widen(model, backend, domain)
+    question = question or digest(model, backend, domain)
+    name, backend = by.prepared(request, family, backend, seed)
+    fit = by if name == by.name else known.build("route", name)
+    refuse(model, backend, family, lipschitz, fit, request.claim, sampling.kept(domain) is not None)
+    asked = Question(model, domain, sampling, lipschitz, family, p, by, fit, request, symmetries, seed, question)
+
+    plan = replace(hidden or HiddenPlan(), ignore=(*(hidden or HiddenPlan()).ignore, *symmetries))
+    gate = entry.enter(model, backend, domain, plan, request.claim, executor, seed, emit)  # f̂ is a function of (x, u)
     with Kept(executor) as pools:
-        key = digest(asked.model, gate.system, domain)
-        store = Store(Path(folder) / "samples", residual, key, pools, asked.sampling.chunk, emit)
+        key = digest(model, gate.system, domain)
+        store = Store(Path(folder) / "samples", Residual(gate.system, model), key, pools, sampling.chunk, emit)
         book = Ledger(Path(folder).parent / "ledger.json" if ledger is None else Path(ledger))
         problem = measure(asked, store, gate)  # r at z_1, …, z_N, and constants of g
         gap, problem, record = fitted(asked, problem, store, book)  # l ≤ r ≤ u, so |r| ≤ γ, on Z
         audited = audit(gap, problem, asked, store, book, record)  # attacked at points that no fit has seen
-    return conclude(asked, gap, problem, record, audited, residual, gate, store)  # what may be said
+    return conclude(asked, gap, problem, record, audited, gate, store)  # what may be said
 
 
 @final
 @dataclass(frozen=True)
 class Question:
-    """What is asked of which systems, with all defaults filled in. `fit`: the route by which the family is fitted."""
+    """What is asked of model and domain, with all defaults filled in. `fit`: the route by which the family is fitted."""
 
     model: Model
-    backend: System
     domain: Domain
     sampling: Sampling
     lipschitz: LipschitzEstimator
@@ -117,53 +117,9 @@ class Question:
     route: Route
     fit: Route
     request: Request
-    plan: HiddenPlan
     symmetries: Sequence[str]
     seed: int
     digest: str
-
-    @classmethod
-    def of(
-        cls,
-        model: Model,
-        backend: System,
-        domain: Domain,
-        *,
-        sampling: Sampling | None,
-        lipschitz: LipschitzEstimator | None,
-        family: GapFamily | None,
-        predictor: Predictor | Model | None,
-        route: str | None,
-        request: Request | None,
-        hidden: HiddenPlan | None,
-        symmetries: Sequence[str],
-        seed: int,
-        question: str | None,
-    ) -> Question:
-        """UsageError where the ingredients do not fit together."""
-        known = registry()
-        family = family or known.build("gap_family", "envelope")
-        by: Route = known.build("route", route or family.routes[0])
-        request = request or Request(by.claim)
-        bounded = by.constants and "seed" not in backend.capabilities
-        if lipschitz is None or not by.constants:
-            lipschitz = known.build("lipschitz", "wood-zhang" if bounded else "none")
-        sampling = _sampling(sampling, family, domain, bounded)
-        p = predictor or family.predictor
-        if isinstance(p, Model):
-            p, _ = gates.widen(p, backend, domain)
-        gates.contain(model, domain)
-        model, backend = gates.widen(model, backend, domain)
-        question = question or digest(model, backend, domain)
-        name, backend = by.prepared(request, family, backend, seed)
-        fit = by if name == by.name else known.build("route", name)
-        refuse(model, backend, family, lipschitz, fit, request.claim, sampling.kept(domain) is not None)
-        plan = replace(hidden or HiddenPlan(), ignore=(*(hidden or HiddenPlan()).ignore, *symmetries))
-        return cls(model, backend, domain, sampling, lipschitz, family, p, by, fit, request, plan, symmetries, seed, question)
-
-    def admitted(self, executor: Callable[[], Executor], emit: Emit) -> Gate:
-        """Both systems are functions of their arguments, hidden state is dealt with, and inputs arrive."""
-        return gates.enter(self.model, self.backend, self.domain, self.plan, self.request.claim, executor, self.seed, emit)
 
 
 def _sampling(given: Sampling | None, family: GapFamily, domain: Domain, bounded: bool) -> Sampling:
@@ -192,9 +148,9 @@ def measure(question: Question, store: Store, gate: Gate) -> GapProblem:
         return store.collect(name, Points(points))
 
     none = AffinePredictor.none(domain.nx, len(domain.low))
-    asked = LipschitzProblem(domain, none, e, query, residual.model, residual.backend, seed)
-    asked = replace(asked, paired=gates.paired(store, gate), rounding=rounding)
-    symmetry = checked(symmetries, asked) if symmetries else None
+    pairs = entry.paired(store, gate)
+    asked = LipschitzProblem(domain, none, e, query, residual.model, residual.backend, seed, pairs, rounding)
+    symmetry = Symmetry.checked(symmetries, asked) if symmetries else None
     held = () if symmetry is None else symmetry.axes
     sampling = sampling.holding(held)
     samples = store.samples("bound-0", sampling.first(domain), sampling.kept(domain))
@@ -208,9 +164,9 @@ def measure(question: Question, store: Store, gate: Gate) -> GapProblem:
         further = constants.cells.points(domain, samples.r, (sampling.budget or 0) - len(samples))
     else:
         further = sampling.further(domain, samples.z, samples.r, constants.value, constants)
+    problem = GapProblem(samples, domain, constants, p, e, question.fit.name, seed, rounding=rounding, symmetry=symmetry)
     if further is not None:
-        known = GapProblem(samples, domain, constants, p, e, question.fit.name, seed, rounding=rounding)
-        samples = refined(known, further, sampling.tightness, query)
+        samples = refined(problem, further, sampling.tightness, query)
     if isinstance(sampling, LatticeSampling):
         samples = replace(samples, lattice=axes_of(samples.z if further is None else further))
     if constants.cells is not None and question.fit.cells and len(bare := constants.cells.bare(domain, samples.z)):
@@ -218,8 +174,7 @@ def measure(question: Question, store: Store, gate: Gate) -> GapProblem:
             f"lipschitz {constants.method}: {len(bare)} of {len(constants.cells)} cells may meet Z and have no sample; the "
             f"estimator is broken: its anchors must hold a point of every cell that meets Z"
         )
-    problem = GapProblem(samples, domain, constants, p, e, question.fit.name, seed, rounding=rounding, symmetry=symmetry)
-    return replace(problem, emit=store.emit, folder=store.folder.parent / "fit")
+    return replace(problem, samples=samples, emit=store.emit, folder=store.folder.parent / "fit")
 
 
 def _predictor(choice: Any, samples: Samples, model: Model, domain: Domain) -> Predictor:
@@ -312,54 +267,31 @@ def conclude(
     problem: GapProblem,
     record: Record | None,
     audited: Audit,
-    residual: Residual,
     gate: Gate,
     store: Store,
 ) -> Certificate:
     """Evidence and the strongest claim, of those asked for, that the evidence allows."""
-    route, request = question.route, question.request
+    route, request, model = question.route, question.request, question.model
     refuted = route.refuted(problem, gap)
-    gate = gates.attacked(gate, gap, problem, residual.model, store.emit)
-    attacked = attack(gap, residual, problem.domain, request.attack, problem.seed, store.emit) if request.attack else {}
+    gate = hidden_state.attacked(gate, gap, problem, model, store.emit)
+    attacked = attack(gap, store.residual, problem.domain, request.attack, problem.seed, store.emit) if request.attack else {}
     if record is not None and attacked:
         attacked["allowed"] = record.allowed(request.attack, request.epsilon)
-    rests = route.sentences(Findings(problem, gap, record, audited, residual.model, gate, refuted))
+    rests = route.sentences(Findings(problem, gap, record, audited, model, gate, refuted))
     drawn = f"uniform on {problem.domain.words}{gate.distribution}{'' if record is None else record.draws}"
     constant, envelope = route.yardsticks(gap, problem, record, audited.z)
+    over = refuted is not None or points_refute(audited, attacked, gate)
     return Certificate(
         gap,
         problem,
-        _claim(problem.lipschitz, audited, request, refuted, attacked, gate, drawn),
+        Claim.supported(request.claim, problem.lipschitz.provenance, over, request.epsilon, request.beta, drawn),
         tuple(rests),
-        figures(gap, problem, residual.model, audited.z, audited.r, constant, envelope),
+        figures(gap, problem, model, audited.z, audited.r, constant, envelope),
         audited,
         attacked,
         dict(store.digests),
         {"gapcert": __version__, "numpy": np.__version__, "python": platform.python_version()},
         gate,
-        residual.model,
+        model,
         record,
-    )
-
-
-def _claim(
-    lipschitz: LipschitzBound,
-    audited: Audit,
-    request: Request,
-    refuted: dict[str, Any] | None,
-    attacked: dict[str, int],
-    gate: Gate,
-    drawn: str,
-) -> Claim:
-    if request.claim == "assumed":
-        return Claim("assumed")
-    over = attacked.get("violations", 0) > attacked.get("allowed", 0)
-    outside = audited.refutes or over or gate.attack.get("violations", 0)
-    return Claim.supported(
-        request.claim,
-        lipschitz.provenance,
-        bool(outside) or refuted is not None,
-        request.epsilon,
-        request.beta,
-        drawn,
     )

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 from gapcert.certification.routes import Route
 from gapcert.certification.thresholds import THRESHOLDS
+from gapcert.contracts.data.units import same_unit
 from gapcert.contracts.gaps.gap import GapFamily
 from gapcert.contracts.gaps.lipschitz import LipschitzEstimator
 from gapcert.contracts.systems.system import Model, StateSpec, System
@@ -27,8 +28,6 @@ def unmatched(what: str, want: Sequence[StateSpec], have: Sequence[StateSpec]) -
     """Why axes `have` do not carry the numbers of the model's axes `want`, or nothing."""
     if [s.name for s in want] != [s.name for s in have]:
         return f"its {what} are {_names(have)}, the model's {_names(want)}; they must agree"
-    from gapcert.contracts.data.units import same_unit
-
     for w, h in zip(want, have, strict=True):
         if w.unit != h.unit and not same_unit(w.unit, h.unit):
             said = f"its {what[:-1]} '{h.name}' is in '{h.unit}', the model's in '{w.unit}'"
@@ -77,13 +76,13 @@ def refuse(
             "certificate.claim: deterministic needs Lipschitz constants that are declared or proved by intervals, and an "
             "estimate is neither; ask for a statistical claim, or choose another lipschitz.residual"
         )
+    if model.hidden:
+        declaration = f"hidden: {{sample: {{ranges: {{{model.hidden[0].name}: [low, high]}}}}}}"
+        raise UsageError(
+            f"certify: the model has hidden state ({_names(model.hidden)}), so its gap is no function of (x, u); declare "
+            f"a range for each ({declaration}), measure them, or certify a model without them"
+        )
     for role, system in (("model", model), ("backend", backend)):
-        if system.hidden and role == "model":
-            declaration = f"hidden: {{sample: {{ranges: {{{system.hidden[0].name}: [low, high]}}}}}}"
-            raise UsageError(
-                f"certify: the model has hidden state ({_names(system.hidden)}), so its gap is no function of (x, u); declare "
-                f"a range for each ({declaration}), measure them, or certify a model without them"
-            )
         if "seed" in system.capabilities:
             raise UsageError(
                 f"certify: the {role} is stochastic (capability 'seed'), so its gap is no function of (x, u); "

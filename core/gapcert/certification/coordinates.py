@@ -12,6 +12,7 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert.contracts.data.inequality import substitution
 from gapcert.contracts.gaps.gap import GapFunction
 from gapcert.contracts.gaps.predictor import Predictor
 from gapcert.contracts.systems.domain import Box, Domain, Relation
@@ -38,8 +39,6 @@ class Coordinates:
     @classmethod
     def of(cls, system: System, given: Mapping[str, str]) -> Coordinates:
         """From texts such as `{dx: ux - vx}`: one for each input, each a sum of that input and of states."""
-        from gapcert.contracts.data.inequality import substitution
-
         states, inputs = ({a.name: a.unit for a in axes} for axes in (system.states, system.inputs))
         found, faults = substitution(given, states, inputs)
         for name, error in faults[:1]:
@@ -68,7 +67,7 @@ class Coordinates:
             for j, c in enumerate(row):
                 u = u - z[:, j : j + 1] * c if c else u
             columns.append(u * (1.0 / self.scale[i]) if abs(self.scale[i]) == 1 else _divided(u, self.scale[i]))
-        return Interval(np.concatenate([c.lo for c in columns], axis=1), np.concatenate([c.hi for c in columns], axis=1))
+        return Interval.concatenate(columns, axis=1)
 
     def over(self, z: Interval) -> Interval:
         """Boxes of (x, u) → boxes that contain (x, w), (n, nz)."""
@@ -79,7 +78,7 @@ class Coordinates:
             for j, c in enumerate(row):
                 w = w + z[:, j : j + 1] * c if c else w
             columns.append(w)
-        return Interval(np.concatenate([c.lo for c in columns], axis=1), np.concatenate([c.hi for c in columns], axis=1))
+        return Interval.concatenate(columns, axis=1)
 
     def arrays(self) -> dict[str, Array]:
         """The numbers of the map, for what is stored."""
@@ -87,12 +86,12 @@ class Coordinates:
 
     def chain(self, jacobian: Interval) -> Interval:
         """∂/∂(x, u) (n, nx, nz) → ∂/∂(x, w) = (J_x − J_u D⁻¹ C, J_u D⁻¹)."""
-        nx = len(self.slope[0])
-        columns = [jacobian[:, :, j] for j in range(nx)]
+        nx, across = len(self.slope[0]), list[Interval]()
+        along = [jacobian[:, :, j] for j in range(nx)]
         for i, row in enumerate(self.slope):
-            across = _divided(jacobian[:, :, nx + i], self.scale[i])
-            columns = [c - across * row[j] if row[j] else c for j, c in enumerate(columns[:nx])] + columns[nx:] + [across]
-        return Interval(np.stack([c.lo for c in columns], axis=-1), np.stack([c.hi for c in columns], axis=-1))
+            across.append(_divided(jacobian[:, :, nx + i], self.scale[i]))
+            along = [c - across[i] * a if a else c for c, a in zip(along, row, strict=True)]
+        return Interval.stack([*along, *across], axis=-1)
 
     def domain(self, domain: Domain) -> Domain:
         """The same set of points in (x, w): its box is the smallest that holds them, the ranges of u become relations."""
@@ -155,45 +154,48 @@ def _ranges(domain: Domain) -> list[Relation]:
     return out
 
 
-@final
-class RelativeSystem(System):
-    """A System whose input is w: it steps under u = (w − C x) / D."""
+class _Relative:
+    """What steps under u = (w − C x) / D."""
 
-    def __init__(self, system: System, coordinates: Coordinates) -> None:
-        self.inner, self.relative = system, coordinates
-        _copy(self, system, coordinates)
+    inner: System
+
+    def __init__(self, inner: System, coordinates: Coordinates) -> None:
+        self.inner, self.relative = inner, coordinates
+        self.states, self.inputs = inner.states, coordinates.axes
+        self.period, self.substeps, self.capabilities = inner.period, inner.substeps, inner.capabilities
+        self.hidden, self.hidden_default = inner.hidden, inner.hidden_default
+        self.parameters, self.coordinates = inner.parameters, inner.coordinates
 
     def _step(self, x: Array, u: Array, **options: Any) -> Step:
         return self.inner.step(x, self.relative.inputs(x, u), **options)
-
-    def scene(self, x: Array, hidden: Array | None = None) -> Scene | None:
-        return self.inner.scene(x, hidden)
 
     def resolution(self, magnitude: Array) -> Array:
         """Twice that of the System itself: u is rounded once more."""
         return np.asarray(2 * self.inner.resolution(magnitude))
 
     def digest(self) -> str:
-        return _digest(self, self.inner, self.relative)
+        # The System says itself what determines its answers: caches and tiles do not.
+        names = [a.name for a in self.inputs]
+        return json_digest(type(self).__qualname__, self.inner.digest(), self.relative.slope, self.relative.scale, names)
 
 
 @final
-class RelativeModel(Model):
+class RelativeSystem(_Relative, System):
+    """A System whose input is w."""
+
+    def scene(self, x: Array, hidden: Array | None = None) -> Scene | None:
+        return self.inner.scene(x, hidden)
+
+
+@final
+class RelativeModel(_Relative, Model):
     """A Model whose input is w."""
 
+    inner: Model
+
     def __init__(self, model: Model, coordinates: Coordinates) -> None:
-        self.inner, self.relative = model, coordinates
+        super().__init__(model, coordinates)
         self.outputs = model.outputs
-        _copy(self, model, coordinates)
-
-    def _step(self, x: Array, u: Array, **options: Any) -> Step:
-        return self.inner.step(x, self.relative.inputs(x, u), **options)
-
-    def resolution(self, magnitude: Array) -> Array:
-        return np.asarray(2 * self.inner.resolution(magnitude))
-
-    def digest(self) -> str:
-        return _digest(self, self.inner, self.relative)
 
     def jacobian(self, x: Array, u: Array) -> Array:
         j = Interval.exact(self.inner.jacobian(x, self.relative.inputs(x, u)))
@@ -222,25 +224,12 @@ class RelativeModel(Model):
         return self.inner.sites(kind)
 
 
-def _copy(wrapper: System, system: System, coordinates: Coordinates) -> None:
-    wrapper.states, wrapper.inputs = system.states, coordinates.axes
-    wrapper.period, wrapper.substeps, wrapper.capabilities = system.period, system.substeps, system.capabilities
-    wrapper.hidden, wrapper.hidden_default = system.hidden, system.hidden_default
-    wrapper.parameters, wrapper.coordinates = system.parameters, system.coordinates
-
-
 def in_words(model: Model, domain: Domain) -> str:
     """The box of a domain, range by range, with what its coordinates stand for."""
     relative = model.relative if isinstance(model, RelativeModel) else None
     texts = {a.name: f" = {text}" for a, text in zip(relative.axes, relative.texts, strict=True)} if relative else {}
     axes = zip(domain.axes, domain.low, domain.high, strict=True)
     return ", ".join(f"{a.name}{texts.get(a.name, '')} in [{x:g}, {y:g}] {a.unit}".removesuffix(" 1") for a, x, y in axes)
-
-
-def _digest(wrapper: System, system: System, coordinates: Coordinates) -> str:
-    # The System says itself what determines its answers: caches and tiles do not.
-    names = [a.name for a in wrapper.inputs]
-    return json_digest(type(wrapper).__qualname__, system.digest(), coordinates.slope, coordinates.scale, names)
 
 
 @final
@@ -259,20 +248,14 @@ class RelativePredictor(Predictor):
     def jacobian_over(self, boxes: Interval) -> Interval:
         """(J_x + J_w C, J_w D)."""
         inner, nx = self.inner.jacobian_over(self.relative.over(boxes)), len(self.relative.slope[0])
-        columns = [inner[:, :, j] for j in range(nx)]
-        for i, (row, scale) in enumerate(zip(self.relative.slope, self.relative.scale, strict=True)):
-            across = inner[:, :, nx + i]
-            columns = (
-                [c + across * row[j] if row[j] else c for j, c in enumerate(columns[:nx])] + columns[nx:] + [across * scale]
-            )
-        return Interval.stack(columns, axis=2)
+        along, across = [inner[:, :, j] for j in range(nx)], [inner[:, :, nx + i] for i in range(len(self.relative.axes))]
+        for c, row in zip(across, self.relative.slope, strict=True):
+            along = [b + c * a if a else b for b, a in zip(along, row, strict=True)]
+        return Interval.stack([*along, *(c * d for c, d in zip(across, self.relative.scale, strict=True))], axis=2)
 
     def resolution(self, domain: Domain) -> Array:
         boxes = self.relative.over(domain.interval)
-        x, u = (
-            domain.interval.mag[0, : len(domain.low) - len(self.relative.axes)],
-            domain.interval.mag[0, -len(self.relative.axes) :],
-        )
+        x, u = np.split(domain.interval.mag[0], [-len(self.relative.axes)])
         # w is the middle of an interval to which each of its products and sums, nx + 1 at most, adds two roundings.
         size = np.abs(self.relative.slope) @ x + np.abs(self.relative.scale) * u
         missed = 4 * (len(x) + 1) * float(np.finfo(float).eps) * size

@@ -2,33 +2,24 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, final
 
-import numpy as np
-
-import gapcert
-from gapcert.certification.assumptions import declaration, scope
-from gapcert.certification.certificate import domain_data
-from gapcert.contracts.data.recording import Recording
+from gapcert.certification.certificate import Statement
+from gapcert.certification.routes import declaration, scope
 from gapcert.contracts.gaps.claim import Claim
 from gapcert.contracts.gaps.gap import GapFunction
-from gapcert.contracts.plugins.presentation import Shown
 from gapcert.contracts.systems.domain import Domain
 from gapcert.contracts.systems.system import Model
-from gapcert.numerics.arrays import Array
-from gapcert.numerics.atomic_files import npz_bytes, write_atomic
 from gapcert.version import __version__
 
 
 @final
 @dataclass(frozen=True, repr=False)
-class Declaration(Shown):
+class Declaration(Statement):
     """|f̂ − f| ≤ γ on Z as a person says it, of a backend that nobody asked. The claim is `assumed`, and never more."""
 
     gap: GapFunction
@@ -44,18 +35,6 @@ class Declaration(Shown):
         nobody = "No simulator was asked: nothing speaks for γ, and nothing was given the chance to refute it."
         return (declaration(self.gap, names, self.domain), nobody, scope(self.model, self.domain))
 
-    def gamma(self, x: Array, u: Array) -> Array:
-        """γ(x, u): x (n, nx), u (n, nu) → (n, nx)."""
-        return self.gap.gamma(np.hstack([x, u]))
-
-    def check(self, recording: Recording, noise: Mapping[str, float] | None = None) -> Any:
-        """New measurements against γ, as a `Check`; noise: by how much channels may err, in the model's units."""
-        return gapcert.check(gapcert.Certified.of(self), recording, noise)
-
-    def monitor(self) -> Any:
-        """γ watched online, one transition at a time: a `Monitor`."""
-        return gapcert.Monitor(gapcert.Certified.of(self))
-
     def summary(self) -> dict[str, Any]:
         """The `certificate` object of the JSON contract: without samples or an audit."""
         top = self.gap.gamma_over(self.domain.interval)[0].tolist()
@@ -70,14 +49,4 @@ class Declaration(Shown):
 
     def save(self, folder: Path | str) -> None:
         """`certificate.json` and `certificate.npz`."""
-        content = npz_bytes({f"gap.{k}": v for k, v in self.gap.arrays().items()})
-        data = {
-            **self.summary(),
-            "form": dict(self.gap.form),
-            "predictor": "none",
-            "domain": domain_data(self.domain),
-            "arrays": hashlib.sha256(content).hexdigest(),
-            "versions": dict(self.versions),
-        }
-        write_atomic(Path(folder) / "certificate.npz", content)
-        write_atomic(Path(folder) / "certificate.json", json.dumps(data, indent=1, sort_keys=True).encode())
+        self._write(Path(folder), self.domain, "none", {})

@@ -8,24 +8,24 @@ from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert.certification.assumptions import assumptions, declaration, origin
-from gapcert.certification.bounds import curvature
-from gapcert.certification.bounds.refutation import contradiction
-from gapcert.certification.bounds.supremum import supremum
 from gapcert.certification.certificate import Audit, Ledger, Record
-from gapcert.certification.gates import Gate
+from gapcert.certification.coordinates import in_words
+from gapcert.certification.gates.hidden_state import Gate
+from gapcert.certification.refutation import contradiction, curvature_contradiction, curvature_sentences, jump_sentence
 from gapcert.certification.samples.store import Store
+from gapcert.certification.supremum import supremum
 from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.gaps.claim import ClaimKind
 from gapcert.contracts.gaps.gap import GapFamily, GapFunction, GapProblem
 from gapcert.contracts.gaps.predictor import Samples
 from gapcert.contracts.plugins.events import Pulse
 from gapcert.contracts.plugins.registry import registry
+from gapcert.contracts.systems.domain import Domain
 from gapcert.contracts.systems.system import Model, System
-from gapcert.numerics.arrays import Array
+from gapcert.numerics.arrays import Array, Ints
 from gapcert.numerics.errors import UsageError
+from gapcert.numerics.interpolation import on_curvature
 
 Refuted = dict[str, Any]
 
@@ -120,8 +120,8 @@ class _Audited(Route):
     def sentences(self, found: Findings) -> list[str]:
         problem, gap, names = found.problem, found.gap, [s.name for s in found.model.states]
         said = [self.refutation(problem, found.refuted, names)] if found.refuted is not None else []
-        probed = assumptions(self.basis(problem, gap, names), problem, found.audit, found.model, found.gate)
-        return [*curvature.sentences(problem, gap), *probed, *self.rest(problem), *said]
+        probed = _assumptions(self.basis(problem, gap, names), problem, found.audit, found.model, found.gate)
+        return [*curvature_sentences(problem, gap), *probed, *self.rest(problem), *said]
 
 
 class _Bounded(_Audited):
@@ -129,7 +129,7 @@ class _Bounded(_Audited):
 
     def refuted(self, problem: GapProblem, gap: GapFunction) -> Refuted | None:
         # No two r_k may break |Δg| ≤ L |Δz| + 2 e.
-        found = contradiction(problem) or curvature.refuted(problem, gap)
+        found = contradiction(problem) or (curvature_contradiction(problem) if on_curvature(gap.form) else None)
         if found is not None or not (low := undershoot(gap, problem.samples)).size:
             return found
         # Where two samples contradict the constants no band contains both; else it is the family that is wrong.
@@ -142,7 +142,7 @@ class _Bounded(_Audited):
         return found
 
     def basis(self, problem: GapProblem, gap: GapFunction, states: Sequence[str]) -> list[str]:
-        return origin(problem)
+        return _origin(problem)
 
     def refutation(self, problem: GapProblem, refuted: Refuted, states: Sequence[str]) -> str:
         return f"REFUTED: two samples contradict the constants of {states[refuted['state']]} by {refuted['excess']:.3g}."
@@ -207,7 +207,7 @@ class Declared(_Audited):
         )
 
 
-def undershoot(gap: GapFunction, samples: Samples) -> npt.NDArray[np.intp]:
+def undershoot(gap: GapFunction, samples: Samples) -> Ints:
     """Samples (by number) with |r| > γ: a plugin's claim is data, and data are checked."""
     blocks = range(0, len(samples), 100_000)
     low = [np.any(np.abs(samples.r[a : a + 100_000]) > gap.gamma(samples.z[a : a + 100_000]), axis=1) for a in blocks]
@@ -217,3 +217,51 @@ def undershoot(gap: GapFunction, samples: Samples) -> npt.NDArray[np.intp]:
 def _envelope(gap: GapFunction, problem: GapProblem) -> GapFunction:
     made: GapFunction = gap if gap.family == "envelope" else registry().build("gap_family", "envelope").fit(problem)
     return made
+
+
+def _assumptions(basis: Sequence[str], problem: GapProblem, audited: Audit, model: Model, gate: Gate) -> list[str]:
+    """What the claim rests on, one sentence each, with provenance; `basis` is what γ itself does."""
+    names = [s.name for s in model.states]
+    return [
+        *basis,
+        "One step of f̂ and of f, as computed, is within e of its exact value: "
+        + ", ".join(f"e({n}) = {e:.2g}" for n, e in zip(names, problem.arithmetic, strict=True))
+        + ".",
+        f"f̂ is a function of its arguments alone: {gate.purity}; this was probed, not proved.",
+        *gate.sentences(),
+        *([problem.symmetry.sentence()] if problem.symmetry is not None else []),
+        scope(model, problem.domain),
+        f"The audit's {len(audited.z)} points are independent and uniform on {problem.domain.words}{gate.distribution} (audit "
+        f"{audited.k} of this question); its statement does not carry over to other distributions, nor to a closed loop.",
+    ]
+
+
+def _origin(problem: GapProblem) -> list[str]:
+    """Whence the constants are, and where they jump."""
+    bound, p = problem.lipschitz, problem.predictor
+    what = "r" if p.kind == "none" else f"r − p (p: {p.kind} predictor)"
+    from_where = {
+        "analytic": "were derived analytically",
+        "interval": "were proved by interval arithmetic from the equations of both systems",
+        "declared": "were declared by the user and are taken on trust",
+        "estimated": f"were estimated by {bound.method} from {bound.samples} transitions and multiplied by {bound.safety:g}; "
+        f"an estimate is not a bound",
+    }[bound.provenance]
+    jumps = jump_sentence(bound, problem.domain.axes)
+    return [f"The per-axis Lipschitz constants of {what} {from_where}.", *filter(None, (jumps,))]
+
+
+def declaration(gap: GapFunction, states: Sequence[str], domain: Domain) -> str:
+    """What a person said of γ."""
+    each = zip(states, gap.gamma_over(domain.interval)[0], strict=True)
+    return f"γ was declared by the user, and is assumed: |f̂ − f| ≤ {', '.join(f'{g:.6g} in {n}' for n, g in each)} on Z."
+
+
+def scope(model: Model, domain: Domain) -> str:
+    """What a claim is about."""
+    texts = ", ".join(dict.fromkeys(r.text for r in domain.relations))
+    zone = f"X × U with {texts}" if texts else "X × U"
+    return (
+        f"The claim is about one period of {model.period:g} s with the input held, on Z = {zone}; "
+        f"what happens between samples and outside Z is not covered. X × U: {in_words(model, domain)}."
+    )

@@ -17,7 +17,6 @@ class Thresholds:
     yardstick_samples: int = chosen(20_000, "from which on no envelope is made beside theorem 1, whose cost grows with them")
     suspects: int = chosen(200, "samples above γ that are held against all others: one contradiction is enough")
     constant_looks: float = chosen(4e8, "at samples, by the branch and bound behind a constant")
-    # bounds
     trail_parts: int = chosen(4, "of a pair in each step: a jump's slope then grows by 4, a settled one by 1")
     trail_clear: float = chosen(16.0, "resolutions: smaller changes tell nothing")
     supremum_batch: int = chosen(2048, "boxes of a round: fewer go to the largest bound first, more cost less each")

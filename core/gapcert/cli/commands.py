@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gapcert.cli.folders.commands import FOLDERS
-from gapcert.contracts.plugins.command import EXECUTED, SET, SPEC, Answer, Argument, Arguments
-from gapcert.contracts.plugins.component import Component
+from gapcert.contracts.plugins.component import EXECUTED, SET, SPEC, Answer, Argument, Arguments, Component
 from gapcert.numerics.errors import UsageError
 
 _KINDS = "model, backend, gap_family, lipschitz, synthesizer, effect, reader, executor, observer or study"

@@ -18,8 +18,7 @@ from contextlib import contextmanager, suppress
 from typing import Any, NoReturn, final
 
 from gapcert.cli.commands import COMMANDS
-from gapcert.contracts.plugins.command import Answer, Argument, Arguments
-from gapcert.contracts.plugins.component import Component
+from gapcert.contracts.plugins.component import Answer, Argument, Arguments, Component
 from gapcert.contracts.plugins.registry import installed
 from gapcert.numerics.errors import MACHINE, NO_ROOM, GapcertError, UsageError, clipped, exit_code, harmless
 from gapcert.version import __version__

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert.numerics.arrays import Array, Bools
+from gapcert.numerics.arrays import Array, Bools, Ints
 from gapcert.numerics.errors import UsageError
 from gapcert.numerics.intervals import Interval
 from gapcert.thresholds import THRESHOLDS
@@ -207,7 +206,7 @@ def lattice(zone: Zone, counts: tuple[int, ...]) -> Lattice:
     return Lattice(np.concatenate(points), half)
 
 
-def _blocks(counts: tuple[int, ...]) -> Iterator[tuple[npt.NDArray[np.intp], ...]]:
+def _blocks(counts: tuple[int, ...]) -> Iterator[tuple[Ints, ...]]:
     size = int(np.prod(counts, dtype=np.int64))
     for start in range(0, size, _BLOCK):
         yield np.unravel_index(np.arange(start, min(start + _BLOCK, size)), counts)
@@ -237,7 +236,7 @@ def grid_points(zone: Zone, counts: tuple[int, ...], start: int, stop: int) -> A
     return out.reshape(-1, len(counts))[first : first + max(stop - start, 0)]
 
 
-def grid_at(zone: Zone, counts: tuple[int, ...], index: npt.NDArray[np.int64]) -> Array:
+def grid_at(zone: Zone, counts: tuple[int, ...], index: Ints) -> Array:
     """The points of the grid with given numbers (n,): what `grid_points` has there, bit for bit."""
     free, out = _free(zone), np.empty((len(index), len(counts)))
     if zone.relations:

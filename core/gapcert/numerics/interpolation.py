@@ -10,12 +10,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert.numerics.arrays import Array
+from gapcert.numerics.arrays import Array, Ints
 from gapcert.numerics.intervals import Interval
 
-Index = npt.NDArray[np.intp]
 Axes = Sequence[Array]
 
 _BLOCK = 1 << 18  # entries of a working array, which a cache then holds
@@ -38,7 +36,7 @@ def rounding(nz: int) -> float:
     return (8 * nz + 8) * _EPS
 
 
-def cells(axes: Axes, low: Array, high: Array, closed: bool = False) -> tuple[Index, Index]:
+def cells(axes: Axes, low: Array, high: Array, closed: bool = False) -> tuple[Ints, Ints]:
     """The first and the last cell of each axis that a box [low, high] (n, nz) meets; with `closed`, in its closure."""
     first, last = np.zeros((2, *low.shape), dtype=np.intp)
     for j, a in enumerate(axes):
@@ -54,7 +52,7 @@ def cells(axes: Axes, low: Array, high: Array, closed: bool = False) -> tuple[In
     return first, last
 
 
-def cut(axes: Axes, boxes: Interval, first: Index, last: Index, most: int = 8) -> tuple[Index, Interval, Index, Index]:
+def cut(axes: Axes, boxes: Interval, first: Ints, last: Ints, most: int = 8) -> tuple[Ints, Interval, Ints, Ints]:
     """Boxes (n, nz) cut at the nodes between cells first … last of each axis, where that gives at most so many parts of one.
 
     (starts, parts, first, last): where the parts of each box begin, and each part's cells.
@@ -74,7 +72,7 @@ def cut(axes: Axes, boxes: Interval, first: Index, last: Index, most: int = 8) -
     return np.flatnonzero(np.diff(row, prepend=-1)), Interval(low, high), first, last
 
 
-def joined(starts: Index, parts: Interval) -> Interval:
+def joined(starts: Ints, parts: Interval) -> Interval:
     """The hull of the parts (m, …) of each box, which begin at `starts`."""
     return Interval(np.minimum.reduceat(parts.lo, starts), np.maximum.reduceat(parts.hi, starts))
 
@@ -95,7 +93,7 @@ def ranges(axes: Axes, values: Array, low: Array, high: Array) -> tuple[Array, A
     """The least and the largest value over boxes (n, nz), each (n, nx): those of the boxes' corners and of nodes between."""
     out = np.empty((2, len(low), values.shape[-1]))
 
-    def write(rows: Index, window: Array, first: Index, last: Index) -> None:
+    def write(rows: Ints, window: Array, first: Ints, last: Ints) -> None:
         for j in range(len(axes)):
             window = _ends(axes[j], window, j, first, last, low[rows], high[rows])
         inner = tuple(range(1, window.ndim - 1))
@@ -111,7 +109,7 @@ def highest(axes: Axes, values: Array, low: Array, high: Array, slope: Array) ->
     out = np.empty(len(low))
     middle = np.clip(low / 2 + high / 2, low, high)
 
-    def write(rows: Index, window: Array, first: Index, last: Index) -> None:
+    def write(rows: Ints, window: Array, first: Ints, last: Ints) -> None:
         for j, a in enumerate(axes):
             x, y = low[rows, j : j + 1], high[rows, j : j + 1]
             if len(a) < 2:
@@ -131,13 +129,12 @@ def highest(axes: Axes, values: Array, low: Array, high: Array, slope: Array) ->
     return out
 
 
-def slopes(axes: Axes, values: Array, low: Array, high: Array, closed: bool = True) -> tuple[Array, Array]:
-    """The least and the largest slope along each axis over closed boxes, (n, nx, nz); those of difference quotients inside the
-    boxes unless `closed`."""
+def slopes(axes: Axes, values: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """The least and the largest slope along each axis over closed boxes, (n, nx, nz)."""
     nz = len(axes)
     out = np.zeros((2, len(low), values.shape[-1], nz))
 
-    def write(rows: Index, window: Array, first: Index, last: Index) -> None:
+    def write(rows: Ints, window: Array, first: Ints, last: Ints) -> None:
         for j in (j for j in range(nz) if len(axes[j]) > 1):
             size = np.diff(axes[j])[first[:, j : j + 1] + np.arange(window.shape[j + 1] - 1)]
             part = np.diff(window, axis=j + 1) / size.reshape(len(rows), *(-1 if k == j else 1 for k in range(nz)), 1)
@@ -146,11 +143,11 @@ def slopes(axes: Axes, values: Array, low: Array, high: Array, closed: bool = Tr
             inner = tuple(range(1, part.ndim - 1))
             out[0, rows, :, j], out[1, rows, :, j] = part.min(axis=inner), part.max(axis=inner)
 
-    _by_size(axes, values, *cells(axes, low, high, closed), write)
+    _by_size(axes, values, *cells(axes, low, high, closed=True), write)
     return out[0], out[1]
 
 
-def _by_size(axes: Axes, values: Array, first: Index, last: Index, write: Callable[[Index, Array, Index, Index], None]) -> None:
+def _by_size(axes: Axes, values: Array, first: Ints, last: Ints, write: Callable[[Ints, Array, Ints, Ints], None]) -> None:
     """Boxes that meet equally many cells along each axis are looked at together."""
     if not len(first):
         return
@@ -161,7 +158,7 @@ def _by_size(axes: Axes, values: Array, first: Index, last: Index, write: Callab
             write(some, window, first[some], last[some])
 
 
-def _windows(axes: Axes, values: Array, first: Index, last: Index, rows: Index) -> Iterator[tuple[Index, Array]]:
+def _windows(axes: Axes, values: Array, first: Ints, last: Ints, rows: Ints) -> Iterator[tuple[Ints, Array]]:
     """(rows, nodes' values (n, m_0, …, nx)) block by block; all rows meet equally many cells."""
     if not len(rows):
         return
@@ -176,7 +173,7 @@ def _windows(axes: Axes, values: Array, first: Index, last: Index, rows: Index) 
         yield some, flat[(first[some] @ strides).reshape(-1, *(1,) * len(size)) + offset]
 
 
-def _position(nodes: Array, cell: Index, x: Array) -> Array:
+def _position(nodes: Array, cell: Ints, x: Array) -> Array:
     """In [0, 1]: where x is in its cell."""
     if len(nodes) < 2:
         return np.zeros(len(x))
@@ -184,7 +181,7 @@ def _position(nodes: Array, cell: Index, x: Array) -> Array:
     return np.asarray((np.clip(x, a, b) - a) / (b - a))
 
 
-def _ends(nodes: Array, window: Array, j: int, first: Index, last: Index, low: Array, high: Array) -> Array:
+def _ends(nodes: Array, window: Array, j: int, first: Ints, last: Ints, low: Array, high: Array) -> Array:
     """The values along axis j at the box's lower end, at the nodes inside, and at its upper end."""
     if len(nodes) < 2:
         return window

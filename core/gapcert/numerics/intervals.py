@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert.numerics.arrays import Array
+from gapcert.numerics.arrays import Array, Bools, Ints
 
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = float(np.finfo(np.float64).tiny)
@@ -133,7 +132,7 @@ class Interval:
     def finite(self) -> bool:
         return bool(np.isfinite(self.lo).all() and np.isfinite(self.hi).all())
 
-    def contains(self, values: Any) -> npt.NDArray[np.bool_]:
+    def contains(self, values: Any) -> Bools:
         """Elementwise: is the point, or the whole interval, inside?"""
         lo, hi = (values.lo, values.hi) if isinstance(values, Interval) else (values, values)
         return np.asarray((self.lo <= lo) & (hi <= self.hi))
@@ -297,12 +296,21 @@ class Interval:
         lifted = [_lift(p) for p in parts]
         return Interval._of(np.concatenate([p.lo for p in lifted], axis), np.concatenate([p.hi for p in lifted], axis))
 
-    def cut(self, axis: npt.NDArray[np.intp], at: Array | None = None) -> Interval:
+    def cut(self, axis: Ints, at: Array | None = None) -> Interval:
         """Boxes (n, d), each cut across an axis (n,) at its middle, or as near to `at` (n,) as may be; lower parts first."""
         rows, low, high = np.arange(len(self)), self.lo.copy(), self.hi.copy()
         where = self.mid[rows, axis] if at is None else np.clip(at, low[rows, axis], high[rows, axis])
         low[rows, axis] = high[rows, axis] = where
         return Interval.concatenate([Interval(self.lo, high), Interval(low, self.hi)])
+
+
+def norm(values: Array) -> Array:
+    """‖v‖₂ over the last axis, rounded up."""
+    v = Interval.exact(values)
+    square, total = (v * v).hi, np.zeros(v.shape[:-1])
+    for j in range(v.shape[-1]):
+        total = np.nextafter(total + square[..., j], np.inf)
+    return np.asarray(np.nextafter(np.sqrt(total), np.inf))
 
 
 def _foreign(value: Any) -> bool:
@@ -331,19 +339,19 @@ def _library(lo: Array, hi: Array) -> Interval:
     return Interval._of(np.where(lo == np.inf, _MAX, low), np.where(hi == -np.inf, -_MAX, high))
 
 
-def _domain(x: Interval, low: float, high: float) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
+def _domain(x: Interval, low: float, high: float) -> tuple[Array, Array, Bools]:
     return np.clip(x.lo, low, high), np.clip(x.hi, low, high), np.asarray((x.hi < low) | (x.lo > high))
 
 
-def _whole(where: npt.NDArray[np.bool_], lo: Array, hi: Array) -> Interval:
+def _whole(where: Bools, lo: Array, hi: Array) -> Interval:
     return Interval._of(np.where(where, -np.inf, lo), np.where(where, np.inf, hi))
 
 
-def _wild(x: Interval) -> npt.NDArray[np.bool_]:
+def _wild(x: Interval) -> Bools:
     return np.asarray(~((np.abs(x.lo) < _HUGE) & (np.abs(x.hi) < _HUGE)))
 
 
-def _holds_integer(x: Interval, period: float, shift: float) -> npt.NDArray[np.bool_]:
+def _holds_integer(x: Interval, period: float, shift: float) -> Bools:
     """May x / period − shift contain an integer? Never a wrong no.
 
     Each quotient errs by less than 4 eps (|t| + 1), with the error of the float period included.

@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert.numerics.arrays import Array
+from gapcert.numerics.arrays import Array, Ints
 from gapcert.numerics.errors import UsageError
 from gapcert.numerics.intervals import Interval
 from gapcert.thresholds import THRESHOLDS
 
 _EPS = float(np.finfo(np.float64).eps)
 
-Index = npt.NDArray[np.intp]
 Bound = Callable[[Interval], Array]
 
 
@@ -199,7 +197,7 @@ def _rates(bound: Bound, cells: Interval, bounds: Array, centre: Array, slopes: 
     return np.asarray(out.T / n)
 
 
-def _cut(cells: Interval, axis: Index, centre: Array) -> tuple[Interval, Index]:
+def _cut(cells: Interval, axis: Ints, centre: Array) -> tuple[Interval, Ints]:
     """(parts, parent): each cell cut along its axis, in two at the middle, or in three where the centre lies inside: the
     centre's part has half of the length on either side.
     """

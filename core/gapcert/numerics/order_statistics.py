@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.numerics.arrays import Array
+from gapcert.numerics.arrays import Array, Ints
 from gapcert.numerics.errors import UsageError
 from gapcert.thresholds import THRESHOLDS
 
@@ -139,7 +139,7 @@ def unit_rank(n: int, epsilon: float, beta: float | None) -> int:
     return n - m
 
 
-def split(n: int, seed: int) -> npt.NDArray[np.int64]:
+def split(n: int, seed: int) -> Ints:
     """The order in which n units are dealt: first to the fit, then to the calibration."""
     return np.random.default_rng([seed, STREAM]).permutation(n)
 

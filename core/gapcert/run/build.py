@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Any, final
 
 from gapcert.certification.certificate import Certificate
-from gapcert.certification.certify import Request, certify, digest
+from gapcert.certification.certify import certify, digest
 from gapcert.certification.coordinates import Coordinates, RelativeGap, RelativeModel, RelativeSystem
 from gapcert.certification.declared import Declaration
-from gapcert.certification.gates import HiddenPlan, unmeasured, widen
-from gapcert.certification.gates.augment import augment, augment_model
+from gapcert.certification.gates.augment import augment, augment_model, unmeasured, widen
+from gapcert.certification.gates.hidden_state import HiddenPlan
+from gapcert.certification.routes import Request
 from gapcert.certification.samples.designs import AdaptiveSampling, GridSampling, LatticeSampling, Sampling
 from gapcert.certification.samples.executors import named
 from gapcert.certification.samples.extremes import Extremes

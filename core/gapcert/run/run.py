@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, final
 
 from gapcert.certification.certificate import Certificate, saved_digest
-from gapcert.certification.gates import forgets, widen
+from gapcert.certification.gates.augment import forgets, widen
 from gapcert.certification.samples.executors import named
 from gapcert.contracts.controllers.control import Controller, SynthesisProblem, Synthesizer
 from gapcert.contracts.controllers.goal import Goal

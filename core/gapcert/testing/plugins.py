@@ -18,7 +18,7 @@ from gapcert.testing.checks import expect
 _LISTING = """
 import sys
 sys.path[:] = {path!r}
-import gapcert.contracts.plugins.hooks, gapcert.contracts.plugins.registry
+import gapcert.contracts.plugins.registry
 before = set(sys.modules)
 import importlib
 importlib.import_module({module!r}).gapcert_components()

@@ -1,4 +1,7 @@
-"""How a sampled hidden state is distributed, and the System that draws it: f̂ as a function of (x, u) again."""
+"""Where hidden states come from: moved from the declared default, visited in rollouts, or drawn by a law.
+
+With a law, f̂ is a function of (x, u) again.
+"""
 
 from __future__ import annotations
 
@@ -6,20 +9,118 @@ import hashlib
 import itertools
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert.certification.gates.hidden_probes import Pool, Range, columns
 from gapcert.certification.thresholds import THRESHOLDS
-from gapcert.contracts.systems.system import Backend, Model, System, difference
-from gapcert.numerics.arrays import Array
+from gapcert.contracts.systems.domain import Domain
+from gapcert.contracts.systems.system import Backend, Model, StateSpec, System, difference, rotated
+from gapcert.numerics.arrays import Array, Bools, Ints
 from gapcert.numerics.counter_rng import Keys, keys, uniforms
 from gapcert.numerics.digest import json_digest
 from gapcert.numerics.errors import UsageError
+
+Range = tuple[float, float]
+
+
+def columns(specs: tuple[StateSpec, ...]) -> list[slice]:
+    """Which columns of a hidden array each hidden state occupies."""
+    ends = np.cumsum([0, *(s.size for s in specs)]).tolist()
+    return [slice(a, b) for a, b in itertools.pairwise(ends)]
+
+
+def default(system: System, n: int) -> Array:
+    """(n, nh): the declared default, n times."""
+    return np.tile(np.asarray(system.hidden_default, dtype=np.float64), (n, 1))
+
+
+def moved(
+    system: System,
+    n: int,
+    rng: np.random.Generator,
+    ranges: Mapping[str, Range] | None = None,
+    only: Collection[str] | None = None,
+) -> Array:
+    """(n, nh): each hidden state (or those in `only`) at one of the two ends of its range, or ± its probe size."""
+    h = default(system, n)
+    for spec, part in zip(system.hidden, columns(system.hidden), strict=True):
+        sign = rng.integers(0, 2, n) * 2.0 - 1.0
+        axis = rng.standard_normal((n, 3))
+        if only is not None and spec.name not in only:
+            continue
+        if spec.kind == "quaternion":
+            h[:, part] = rotated(h[:, part], THRESHOLDS.hidden_move * axis / np.linalg.norm(axis, axis=1, keepdims=True))
+        elif ranges is not None and spec.name in ranges:
+            low, high = ranges[spec.name]
+            h[:, part] = np.where(sign > 0, high, low)[:, None]
+        else:
+            h[:, part] += (sign * (1.0 if spec.unit == "1" else THRESHOLDS.hidden_move))[:, None]
+    return h
+
+
+@final
+@dataclass(frozen=True)
+class Pool:
+    """States visited in rollouts, x (N, nx) in the domain, with the hidden state h (N, nh) that they were visited with."""
+
+    x: Array
+    h: Array
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+
+def visited(
+    system: System, domain: Domain, runs: int, steps: int, seed: int, tell: Callable[[int], None] = lambda steps: None
+) -> Pool:
+    """`runs` rollouts from random states, hidden handed on from the declared default, a fresh random input in each step.
+
+    Inputs are drawn such that (x, u) lies in the domain, relations included; a run that leaves it starts anew. The first
+    quarter of the steps is left out: there the hidden state still remembers a start that nothing led to. tell: called with
+    the steps that are done.
+    """
+    rng = np.random.default_rng([seed, 0x41DD])
+    x, u = (np.ascontiguousarray(part) for part in domain.split(domain.draw(runs, rng)))
+    hidden, age = default(system, runs), np.zeros(runs, dtype=int)
+    xs, hs = [], []
+    for k in range(steps):
+        tell(k)
+        out = system.step(x, u, hidden=hidden)
+        assert out.hidden is not None, "a system with hidden state hands it on"
+        x, hidden, age = out.x, out.hidden, age + 1
+        u, inside = inputs(domain, x, rng)
+        kept = inside & (age > steps // 4)
+        xs.append(x[kept])
+        hs.append(hidden[kept])
+        if (lost := ~inside).any():
+            fresh = domain.draw(int(lost.sum()), rng)
+            x, u, hidden, age = x.copy(), u.copy(), hidden.copy(), age.copy()
+            x[lost], u[lost] = domain.split(fresh)
+            hidden[lost], age[lost] = default(system, len(fresh)), 0
+    return Pool(np.concatenate(xs), np.concatenate(hs))
+
+
+def inputs(domain: Domain, x: Array, rng: np.random.Generator) -> tuple[Array, Bools]:
+    """u (n, nu) with (x, u) in the domain, and where there is one: the first that fits of 64 uniform ones per row."""
+    low, width = domain.low[domain.nx :], domain.width[domain.nx :]
+    tried = low + width * rng.random((len(x), THRESHOLDS.hidden_candidates, len(low)))
+    z = np.concatenate([np.broadcast_to(x[:, None], (*tried.shape[:2], x.shape[1])), tried], axis=2)
+    fits = domain.contains(z.reshape(-1, z.shape[2])).reshape(z.shape[:2])
+    return tried[np.arange(len(x)), fits.argmax(axis=1)], np.asarray(fits.any(axis=1))
+
+
+def change(system: System, a: Array, b: Array) -> Array:
+    """|a − b| of states, one column per state: of a quaternion the angle between the two."""
+    d = difference(system.states, a, b)
+    parts, column = [], 0
+    for s in system.states:
+        width = 3 if s.kind == "quaternion" else 1
+        parts.append(np.linalg.norm(d[:, column : column + width], axis=1))
+        column += width
+    return np.stack(parts, axis=1)
 
 
 class Law(ABC):
@@ -34,7 +135,7 @@ class Law(ABC):
         """About `count` alternatives (n, nh) at the same x, which span the distribution's support."""
 
     @abstractmethod
-    def outside(self, hidden: Array) -> npt.NDArray[np.bool_]:
+    def outside(self, hidden: Array) -> Bools:
         """(n,): which hidden states certainly lie outside what draws can reach, since they leave its box."""
 
     @abstractmethod
@@ -90,7 +191,7 @@ class Ranges(Law):
             out.append(h)
         return out
 
-    def outside(self, hidden: Array) -> npt.NDArray[np.bool_]:
+    def outside(self, hidden: Array) -> Bools:
         h = hidden[:, self.index]
         return np.asarray(((h < self.low) | (h > self.high)).any(axis=1))
 
@@ -122,7 +223,7 @@ class Visited(Law):
         self.scale = np.where(counts, 1 / width, 0.0)
         self.low, self.high = pool.h.min(axis=0), pool.h.max(axis=0)
 
-    def nearest(self, x: Array) -> npt.NDArray[np.intp]:
+    def nearest(self, x: Array) -> Ints:
         """(n, near): which visited states are closest."""
         from scipy.spatial import cKDTree
 
@@ -138,7 +239,7 @@ class Visited(Law):
         index = self.nearest(x)
         return [self.pool.h[index[:, k]] for k in range(self.near)]
 
-    def outside(self, hidden: Array) -> npt.NDArray[np.bool_]:
+    def outside(self, hidden: Array) -> Bools:
         return np.asarray(((hidden < self.low) | (hidden > self.high)).any(axis=1))
 
     def describe(self) -> str:

@@ -9,8 +9,19 @@ from typing import Any, Literal, final
 import numpy as np
 
 from gapcert.certification.gates.augment import Augmented
-from gapcert.certification.gates.hidden_distribution import HiddenDraws, Law, Ranges, Visited
-from gapcert.certification.gates.hidden_probes import Pool, Range, change, columns, inputs, moved, visited
+from gapcert.certification.gates.hidden_distribution import (
+    HiddenDraws,
+    Law,
+    Pool,
+    Range,
+    Ranges,
+    Visited,
+    change,
+    columns,
+    inputs,
+    moved,
+    visited,
+)
 from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.gaps.gap import GapFunction, GapProblem
 from gapcert.contracts.gaps.lipschitz import Residual
@@ -178,33 +189,22 @@ def open_gate(
         return Gate(plan, backend, states, augmented or names, none, probed)
     if plan.mode != "sample":
         raise UsageError(_refusal(probed, plan.mode == "augment", states, backend))
-    law = _law(probed, backend, domain, plan, states, seed, tell)
-    draws = HiddenDraws(backend, law, seed)
-    bound, names = plan.safety * spread(draws, domain, seed), tuple(plan.ranges) or names
-    points = THRESHOLDS.spread_points
-    spent = points * THRESHOLDS.spread_draws if plan.ranges else plan.runs * plan.steps + points * plan.near
-    return Gate(plan, draws, states, names, bound, probed, law, spent=spent)
-
-
-def _law(
-    probed: Probe,
-    backend: System,
-    domain: Domain,
-    plan: HiddenPlan,
-    states: Sequence[str],
-    seed: int,
-    tell: Callable[[str], None],
-) -> Law:
-    if not plan.ranges:
+    law: Law
+    if plan.ranges:
+        if missing := [n for n, _ in probed.ranked() if n not in plan.ranges]:
+            raise UsageError(
+                f"hidden.sample.ranges: no range for {', '.join(missing)}, which matter ({_spreads(probed, states)}); add "
+                f"{missing[0]}: [low, high], or use sample: {{visited: {{}}}}"
+            )
+        law, names, spent = Ranges(backend, plan.ranges), tuple(plan.ranges), THRESHOLDS.spread_draws * THRESHOLDS.spread_points
+    else:
         steps = plan.steps
         pool = visited(backend, domain, plan.runs, steps, seed + 1, lambda k: tell(f"visited, step {k + 1} of {steps}"))
-        return Visited(pool, domain.width[: domain.nx], plan.near, [s.name for s in backend.states], plan.ignore)
-    if missing := [n for n, _ in probed.ranked() if n not in plan.ranges]:
-        raise UsageError(
-            f"hidden.sample.ranges: no range for {', '.join(missing)}, which matter ({_spreads(probed, states)}); add "
-            f"{missing[0]}: [low, high], or use sample: {{visited: {{}}}}"
-        )
-    return Ranges(backend, plan.ranges)
+        law = Visited(pool, domain.width[: domain.nx], plan.near, [s.name for s in backend.states], plan.ignore)
+        spent = plan.runs * steps + THRESHOLDS.spread_points * plan.near
+    draws = HiddenDraws(backend, law, seed)
+    bound = plan.safety * spread(draws, domain, seed)
+    return Gate(plan, draws, states, names, bound, probed, law, spent=spent)
 
 
 def probe(residual: Residual, domain: Domain, ranges: Mapping[str, Range], pool: Pool, seed: int) -> Probe:

@@ -12,14 +12,13 @@ from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert.certification.gates.hidden_probes import moved
+from gapcert.certification.gates.hidden_distribution import moved
 from gapcert.certification.samples.executors import processes
 from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.systems.domain import Domain
 from gapcert.contracts.systems.system import Step, System, difference
-from gapcert.numerics.arrays import Array
+from gapcert.numerics.arrays import Array, Ints
 from gapcert.numerics.errors import UsageError
 
 
@@ -135,7 +134,7 @@ def _bits(step: Step) -> tuple[bytes, bytes]:
 # Other workers
 
 
-def answer(payload: bytes, order: npt.NDArray[np.intp]) -> Step | str:
+def answer(payload: bytes, order: Ints) -> Step | str:
     """Runs in a worker: the permuted rows, or why the system cannot be had there."""
     try:
         loaded: tuple[System, Queries] = pickle.loads(payload)

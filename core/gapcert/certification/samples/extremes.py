@@ -10,9 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.contracts.systems.domain import Cover, Domain, Points
-from gapcert.numerics.arrays import Array
+from gapcert.numerics.arrays import Array, Ints
 
-Integers = npt.NDArray[np.int64]
 Kept = npt.NDArray[np.void]
 
 _PENDING = 1 << 16
@@ -38,7 +37,7 @@ class Extremes:
         each = max(1, int(65_536 ** (1 / len(counts)) + 1e-9))
         return tuple(min(n, each) for n in counts)
 
-    def cell(self, z: Array) -> Integers:
+    def cell(self, z: Array) -> Ints:
         """The numbers (n,) of the cells of points z (n, nz)."""
         number = np.zeros(len(z), np.int64)
         for j, n in enumerate(self.cells):
@@ -46,7 +45,7 @@ class Extremes:
             number = number * n + np.minimum(position, n - 1)
         return number
 
-    def of_chunk(self, first: int, cell: Integers, r: Array) -> Kept:
+    def of_chunk(self, first: int, cell: Ints, r: Array) -> Kept:
         """The records kept of points first, first + 1, … in given cells (n,), with residuals r (n, nx)."""
         rows = _extreme_rows(cell, r, int(np.prod(self.cells)))
         return _records(first + rows, r[rows])
@@ -65,13 +64,13 @@ class Extremes:
         return records[_extreme_rows(self.cell(points.at(records["index"])), records["r"], int(np.prod(self.cells)))]
 
 
-def _records(index: Integers, r: Array) -> Kept:
+def _records(index: Ints, r: Array) -> Kept:
     out = np.empty(len(index), dtype=[("index", "<i8"), ("r", "<f8", (r.shape[1],))])
     out["index"], out["r"] = index, r
     return out
 
 
-def _extreme_rows(cell: Integers, r: Array, cells: int) -> Integers:
+def _extreme_rows(cell: Ints, r: Array, cells: int) -> Ints:
     """Ascending rows that hold, for some cell and state, the first smallest or the first largest r_i. cell (n,), r (n, nx)."""
     if not len(cell):
         return np.empty(0, np.int64)
@@ -90,14 +89,14 @@ def _extreme_rows(cell: Integers, r: Array, cells: int) -> Integers:
     return np.unique(np.concatenate(keep))
 
 
-def _firsts(group: Integers, groups: int) -> Integers:
+def _firsts(group: Ints, groups: int) -> Ints:
     """The first position of each group that occurs, by group."""
     first = np.full(groups, len(group))
     np.minimum.at(first, group, np.arange(len(group)))
     return first[first < len(group)]
 
 
-def _first_equal(values: Array, starts: Integers, ends: Integers, wanted: Array) -> Integers:
+def _first_equal(values: Array, starts: Ints, ends: Ints, wanted: Array) -> Ints:
     """For each span, the first position in it whose value is the wanted one, which occurs there."""
     length = ends - starts
     before = np.cumsum(length) - length

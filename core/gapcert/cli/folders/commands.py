@@ -8,8 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from gapcert.contracts.plugins.command import ALLOW_CODE, Answer, Argument, Arguments
-from gapcert.contracts.plugins.component import Component
+from gapcert.contracts.plugins.component import ALLOW_CODE, Answer, Argument, Arguments, Component
 from gapcert.numerics.errors import GapcertError, UsageError
 
 ORDERS = ("age", "name", "kind", "state", "size", "seconds")

@@ -1,4 +1,4 @@
-"""What a controller is asked for."""
+"""What a controller is asked for: to stay, to reach, or a sequence of regions that an automaton accepts."""
 
 from __future__ import annotations
 
@@ -7,17 +7,75 @@ from dataclasses import dataclass
 from typing import Any, Literal, final, get_args
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert.contracts.controllers.automaton import Automaton
 from gapcert.contracts.systems.domain import Box, Domain
-from gapcert.contracts.systems.region import Region, bounds_of, box_of, turned
+from gapcert.contracts.systems.region import Region, turned
 from gapcert.contracts.systems.system import StateSpec
-from gapcert.numerics.arrays import Array
+from gapcert.numerics.arrays import Array, Bools, Ints
 from gapcert.numerics.errors import UsageError
 
 Kind = Literal["invariance", "reach_avoid", "reach_and_stay", "recurrence", "automaton"]
 TARGETED = ("reach_avoid", "reach_and_stay", "recurrence")
+MOST = 8  # propositions: an automaton has two to their number letters
+
+
+@final
+@dataclass(frozen=True)
+class Automaton:
+    """A deterministic Büchi automaton: a word of letters is accepted if its run visits accepting states again and again.
+
+    A letter is the set of propositions that hold, as a number: bit p is proposition p. after[q][letter] is the next state, −1
+    where none is left. `text`: what it was made of.
+    """
+
+    propositions: tuple[str, ...]
+    after: tuple[tuple[int, ...], ...]
+    accepting: tuple[bool, ...]
+    start: int = 0
+    text: str = ""
+
+    def __post_init__(self) -> None:
+        letters, states = 1 << len(self.propositions), len(self.after)
+        if len(self.propositions) > MOST:
+            raise UsageError(f"automaton: {len(self.propositions)} propositions; at most {MOST} are supported")
+        fits = all(len(row) == letters and all(-1 <= q < states for q in row) for row in self.after)
+        if not fits or not 0 <= self.start < states or len(self.accepting) != states:
+            raise UsageError(f"automaton: its table does not fit {states} states and {letters} letters")
+
+    @property
+    def table(self) -> Ints:
+        """`after` as numbers (states, letters)."""
+        return np.array(self.after, dtype=np.int64)
+
+    @property
+    def done(self) -> Bools:
+        """(states,): accepting, and every letter leads back: what comes later does not matter."""
+        own = np.arange(len(self.after))[:, None]
+        return np.asarray(np.array(self.accepting) & (self.table == own).all(axis=1))
+
+    @property
+    def ends(self) -> bool:
+        """Does every accepted word have a beginning that suffices?"""
+        return bool((self.done == np.array(self.accepting)).all())
+
+    def advance(self, state: Ints, letter: Ints) -> Ints:
+        """States after one more letter; −1 stays."""
+        return np.where(state < 0, -1, self.table[state, letter])
+
+    def to_data(self) -> dict[str, Any]:
+        """JSON-able; `from_data` is its inverse."""
+        return {
+            "propositions": list(self.propositions),
+            "after": [list(row) for row in self.after],
+            "accepting": list(self.accepting),
+            "start": self.start,
+            "text": self.text,
+        }
+
+    @classmethod
+    def from_data(cls, data: Mapping[str, Any]) -> Automaton:
+        after = tuple(tuple(row) for row in data["after"])
+        return cls(tuple(data["propositions"]), after, tuple(data["accepting"]), data["start"], data["text"])
 
 
 @final
@@ -62,20 +120,20 @@ class Goal:
             raise UsageError(f"goal: stay is over {', '.join(self.stay.names)}; expected the model's states {names}")
         _inside("stay", self.stay, "the domain", domain.states)
 
-    def holds(self, x: Array) -> npt.NDArray[np.bool_]:
+    def holds(self, x: Array) -> Bools:
         """(n,) booleans: in `stay` and not in `avoid`, for states (n, nx)."""
         inside = np.asarray(self.stay.contains(turned(self.stay, x)))
         return inside if self.avoid is None else inside & ~self.avoid.contains(x)
 
-    def reached(self, x: Array) -> npt.NDArray[np.bool_]:
+    def reached(self, x: Array) -> Bools:
         """(n,) booleans: the goal is over, successfully. Only reach-avoid ends."""
         return self.visited(x) if self.kind == "reach_avoid" else np.zeros(len(x), dtype=bool)
 
-    def visited(self, x: Array) -> npt.NDArray[np.bool_]:
+    def visited(self, x: Array) -> Bools:
         """(n,) booleans: in the target, and the goal holds."""
         return np.zeros(len(x), dtype=bool) if self.target is None else self.target.contains(x) & self.holds(x)
 
-    def letter(self, x: Array) -> npt.NDArray[np.int64]:
+    def letter(self, x: Array) -> Ints:
         """(n,): the regions that the states are in, bit p for region p."""
         out = np.zeros(len(x), dtype=np.int64)
         for p, region in enumerate(self.regions):
@@ -87,7 +145,7 @@ class Goal:
         data: dict[str, Any] = {
             "kind": self.kind,
             "axes": [[a.name, a.unit, a.kind] for a in self.stay.axes],
-            "stay": bounds_of(self.stay),
+            "stay": self.stay.bounds,
         }
         regions = {"target": self.target, "avoid": self.avoid}
         data |= {name: region.to_data() for name, region in regions.items() if region is not None}
@@ -104,7 +162,7 @@ class Goal:
 
         automaton = Automaton.from_data(data["automaton"]) if "automaton" in data else None
         regions = tuple(Region.from_data(axes, r) for r in data.get("regions", ()))
-        return cls(data["kind"], box_of(axes, data["stay"]), region("target"), region("avoid"), automaton, regions)
+        return cls(data["kind"], Box.of(axes, data["stay"]), region("target"), region("avoid"), automaton, regions)
 
 
 def _inside(name: str, inner: Box, frame: str, outer: Box) -> None:

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Literal, final
 
 import numpy as np
 
-from gapcert.contracts.data.units import stated_units
+from gapcert.contracts.data.units import magnitude, stated_units
 from gapcert.contracts.thresholds import THRESHOLDS
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.errors import UsageError, clipped
@@ -331,8 +331,6 @@ def _fraction(value: Any) -> float:
 
 
 def _bound(value: Any) -> float:
-    from gapcert.contracts.data.units import magnitude
-
     try:
         return magnitude(value, "s")
     except ValueError as error:
@@ -372,8 +370,6 @@ def seconds(table: str, column: str, values: Any, unit: str, place: Place = coun
 
 
 def _factor(channel: str, unit: str, to: str) -> float:
-    from gapcert.contracts.data.units import magnitude
-
     try:
         zero, one = (magnitude(f"{v} {unit}", to) for v in "01")
     except ValueError as error:

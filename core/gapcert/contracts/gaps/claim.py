@@ -38,9 +38,11 @@ class Claim:
         """What may be said where `asked` was asked for; never more than that.
 
         Anything that refutes it (a point of the audit or the attack outside [l, u], two samples against the constants) leaves
-        `empirical`. `deterministic` rests on constants that are no estimate; `statistical` on the audit alone, with its ε, β
-        and distribution, whatever the constants are.
+        `empirical`, except of `assumed`. `deterministic` rests on constants that are no estimate; `statistical` on the audit
+        alone, with its ε, β and distribution, whatever the constants are.
         """
+        if asked == "assumed":
+            return cls("assumed")
         if not refuted and asked == "deterministic" and provenance != "estimated":
             return cls("deterministic")
         if not refuted and asked == "statistical":

@@ -10,9 +10,8 @@ from typing import Any, Literal, final
 
 import numpy as np
 
-from gapcert.contracts.gaps.lipschitz import LipschitzBound
+from gapcert.contracts.gaps.lipschitz import LipschitzBound, Symmetry
 from gapcert.contracts.gaps.predictor import Predictor, Samples
-from gapcert.contracts.gaps.symmetry import Symmetry
 from gapcert.contracts.plugins.events import Emit, silent
 from gapcert.contracts.systems.domain import Domain
 from gapcert.numerics.arrays import Array

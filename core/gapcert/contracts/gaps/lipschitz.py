@@ -1,10 +1,10 @@
-"""How fast a residual can change: bounds with a provenance, and what makes them."""
+"""How fast a residual can change: bounds with a provenance, what makes them, and axes along which it does not change at all."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, final
 
 import numpy as np
@@ -13,10 +13,11 @@ from gapcert.contracts.gaps.predictor import Predictor
 from gapcert.contracts.systems.cells import Cells
 from gapcert.contracts.systems.domain import Domain
 from gapcert.contracts.systems.system import Backend, Model, StateSpec, System, difference
+from gapcert.contracts.thresholds import THRESHOLDS
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.errors import UsageError
 from gapcert.numerics.interpolation import worst
-from gapcert.numerics.intervals import Interval
+from gapcert.numerics.intervals import norm
 
 Provenance = Literal["analytic", "interval", "declared", "estimated"]
 
@@ -117,12 +118,7 @@ class LipschitzBound:
 
     def joint(self, columns: slice) -> Array:
         """(nx,) Euclidean constant over a block of axes: |Δg_i| ≤ ‖L_i,block‖₂ ‖Δz_block‖₂ (Cauchy–Schwarz), rounded up."""
-        v = Interval.exact(self.value[:, columns])
-        square = (v * v).hi
-        total = np.zeros(len(square))
-        for j in range(square.shape[1]):
-            total = np.nextafter(total + square[:, j], np.inf)
-        return np.asarray(np.nextafter(np.sqrt(total), np.inf))
+        return norm(self.value[:, columns])
 
 
 @final
@@ -180,3 +176,84 @@ class LipschitzEstimator(ABC):
     @abstractmethod
     def bound(self, problem: LipschitzProblem) -> LipschitzBound:
         """Per state and per axis; any safety factor included and stated."""
+
+
+@final
+@dataclass(frozen=True)
+class Symmetry:
+    """r(z) = r(z′) for all z, z′ in Z that differ along `axes` (by number) alone: declared, and checked on `pairs` pairs.
+
+    deviation (nx): the largest |r_i(z) − r_i(z′)| that was seen, at most 4 e.
+    """
+
+    names: tuple[str, ...]
+    axes: tuple[int, ...]
+    pairs: int
+    deviation: tuple[float, ...]
+
+    @classmethod
+    def checked(cls, names: Sequence[str], problem: LipschitzProblem, pairs: int = THRESHOLDS.symmetry_pairs) -> Symmetry:
+        """The symmetry under shifts along named axes; UsageError with the worst pair where r changes by more than 4 e.
+
+        Points are drawn from Z, their partners differ along the axes, uniformly. Each computed residual errs by at most e, and
+        r itself may change by 2 e, as between any two samples.
+        """
+        domain, axes = problem.domain, _numbers(names, problem.domain)
+        rng = np.random.default_rng([problem.seed, 0x5E77])
+        start = domain.draw(pairs, rng)
+        end = start.copy()
+        end[:, axes] = (domain.low + domain.width * rng.random(start.shape))[:, axes]
+        change, e = problem.change("symmetry", start, end)
+        deviation = np.abs(change)
+        over = deviation / (4 * e)
+        if (over > 1).any():
+            k, i = np.unravel_index(int(np.argmax(over)), over.shape)
+            raise UsageError(
+                f"symmetries.translation: the residual of {domain.axes[i].name} changes by {deviation[k, i]:.3g} from (x, u) = "
+                f"{start[k].tolist()} to {end[k].tolist()}, which differ along {', '.join(names)} alone, and in "
+                f"{int((over > 1).any(axis=1).sum())} of {pairs} pairs by more than the resolution allows "
+                f"(4 e = {4 * e[i]:.3g}); leave out the symmetry, or mend the system"
+            )
+        return cls(tuple(names), tuple(axes), pairs, tuple(deviation.max(axis=0).tolist()))
+
+    def applied(self, bound: LipschitzBound, predictor: Predictor, domain: Domain) -> LipschitzBound:
+        """The constants of g = r − p with those along the axes set to what p alone changes, which is mostly nothing."""
+        axes, slope = list(self.axes), predictor.jacobian_over(domain.interval).mag[0]
+        value, lower, cells = bound.value.copy(), bound.lower.copy(), bound.cells
+        slabs = None if bound.slabs is None else tuple(None if j in axes else s for j, s in enumerate(bound.slabs))
+        value[:, axes], lower[:, axes] = slope[:, axes], 0.0
+        if cells is not None:
+            constants = cells.constants.copy()
+            constants[:, :, axes] = slope[:, axes]
+            cells = replace(cells, constants=constants)
+        if (curvature := bound.curvature) is not None:
+            curvature = curvature.copy()
+            curvature[:, axes] = np.where(slope[:, axes] > 0, np.inf, 0.0)
+        return replace(bound, value=value, lower=lower, cells=cells, curvature=curvature, slabs=slabs)
+
+    def sentence(self) -> str:
+        """What a certificate assumes because of it."""
+        what = f"{' and '.join(self.names)} {'are' if len(self.names) > 1 else 'is'} shifted"
+        return (
+            f"The residual does not change when {what}: declared by the user, and checked on "
+            f"{self.pairs} pairs of points of Z, which differed by up to {max(self.deviation):.3g}; the audit does not use it."
+        )
+
+    def to_data(self) -> dict[str, Any]:
+        """JSON-able."""
+        return {"axes": list(self.axes), "names": list(self.names), "pairs": self.pairs, "deviation": list(self.deviation)}
+
+
+def _numbers(names: Sequence[str], domain: Domain) -> list[int]:
+    known = [a.name for a in domain.axes]
+    for name in names:
+        if name not in known:
+            raise UsageError(f"symmetries.translation: '{name}' is no state or input; there are {', '.join(known)}")
+        # Along an axis that relations involve, a shift may leave Z, where nothing is known of r.
+        for relation in domain.relations:
+            if relation.coefficients[known.index(name)]:
+                raise UsageError(
+                    f"symmetries.translation: '{name}' stands in the relation '{relation.text}', so that Z is not the same for "
+                    f"all its values; leave it out of one of them"
+                )
+    return [known.index(name) for name in names]

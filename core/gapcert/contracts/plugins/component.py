@@ -1,15 +1,15 @@
-"""What a plugin declares: a component by kind and name, as text, so that listing imports nothing of it."""
+"""What a plugin declares: a component by kind and name, and what a command takes, as data: listing imports nothing of it."""
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import importlib.util
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, final
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, final
 
-from gapcert.contracts.plugins.command import Argument
 from gapcert.numerics.errors import MissingDependency, UsageError
 
 if TYPE_CHECKING:
@@ -22,6 +22,44 @@ INNER = ("automaton", "command", "contract", "diagnoser", "illustrator", "report
 adds figures to events, as `make(folder, emit)`, an Emit; a `report` makes a page of a run folder; a `route` turns a band into a
 claim; a `section` is a key of specs, and a `study` carries one out; a `view` shows the results of a class.
 """
+
+
+@final
+@dataclass(frozen=True)
+class Argument:
+    """`flags` are one name in capitals, as `RUN`, or options, as `--quiet -q`; `how` is what argparse is told besides."""
+
+    flags: str
+    help: str
+    how: Mapping[str, Any] = field(default_factory=dict)
+
+
+Arguments = argparse.Namespace
+
+
+class Answer(NamedTuple):
+    """What a command, a function of its parsed options, returns: `data` for --json, `words` for people, and the exit code."""
+
+    data: object
+    words: Iterable[str] = ()
+    code: int = 0
+
+
+SPEC = Argument("SPEC", "a spec file (YAML)")
+RUN = Argument("RUN", "the folder of a finished run")
+LOG = Argument("LOG", "a log: CSV, Parquet, HDF5, .mat, MCAP, a ROS 2 bag, a LeRobot data set; or a spec that names one")
+SET = Argument("--set", "override a value of the spec", {"action": "append", "default": [], "metavar": "PATH=VALUE"})
+ALLOW_CODE = Argument("--allow-code", "run Python functions that the spec names", {"action": "store_true"})
+EXECUTED = (
+    SPEC,
+    SET,
+    Argument("--out", "where run folders go (runs)", {"type": Path, "default": Path("runs"), "metavar": "DIR"}),
+    Argument("--executor", "what computes samples: processes, threads, dask, dask:ADDRESS", {"metavar": "NAME"}),
+    ALLOW_CODE,
+    Argument("--view", "open a live Rerun viewer", {"action": "store_true"}),
+    Argument("--quiet -q", "no progress; warnings, as of repaired data, stay", {"action": "store_true"}),
+)
+"""What a command takes that executes a spec; `gapcert.cli.main:execute` is its function."""
 
 
 @final

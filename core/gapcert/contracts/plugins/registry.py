@@ -1,25 +1,42 @@
-"""How a declared name becomes an object: tolerant discovery, lazy loading, one-sentence errors."""
+"""How a declared name becomes an object: hooks, tolerant discovery, lazy loading, one-sentence errors.
+
+A plugin module implements any of the hooks, decorated with `gapcert.hookimpl`.
+"""
 
 from __future__ import annotations
 
 import difflib
 import functools
 import importlib.metadata
+import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, final
+
+import pluggy
 
 from gapcert.contracts.plugins.component import INNER, KINDS, Component, Context, load
 from gapcert.numerics.errors import UsageError
 from gapcert.version import __version__
 
 if TYPE_CHECKING:
-    import pluggy
-
     from gapcert.contracts.plugins.events import Emit, Event
 
 GROUP = "gapcert"
 _OWN = f"gapcert {__version__}"
+
+hookspec = pluggy.HookspecMarker("gapcert")
+hookimpl = pluggy.HookimplMarker("gapcert")
+
+
+@hookspec
+def gapcert_components() -> list[Component]:  # type: ignore[empty-body]  # pluggy never calls a specification
+    """Declare what this plugin offers. Called once, when components are first listed; must import nothing heavy."""
+
+
+@hookspec
+def gapcert_event(event: Event) -> None:
+    """Observe a run: called for every event (stages, progress, warnings), never per sample. Errors are reported, not fatal."""
 
 
 @final
@@ -140,12 +157,8 @@ def installed() -> Registry:
 
 def discover(entry_points: Iterable[importlib.metadata.EntryPoint]) -> Registry:
     """Load every plugin module that loads; remember, with distribution and version, those that do not, and collisions."""
-    import pluggy
-
-    from gapcert.contracts.plugins import hooks
-
     manager = pluggy.PluginManager("gapcert")
-    manager.add_hookspecs(hooks)
+    manager.add_hookspecs(sys.modules[__name__])
     components, broken = [replace(c, distribution=_OWN) for c in BUILTIN], []
     for point in sorted(entry_points, key=lambda p: (_owner(p), p.name)):
         try:

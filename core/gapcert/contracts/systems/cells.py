@@ -8,14 +8,11 @@ from functools import cached_property
 from typing import final
 
 import numpy as np
-import numpy.typing as npt
 
 from gapcert.contracts.systems.domain import Domain
-from gapcert.numerics.arrays import Array
+from gapcert.numerics.arrays import Array, Bools, Ints
 from gapcert.numerics.errors import UsageError
 from gapcert.numerics.intervals import Interval
-
-Index = npt.NDArray[np.intp]
 
 
 @final
@@ -30,9 +27,9 @@ class Cells:
 
     low: Array
     high: Array
-    axis: Index
+    axis: Ints
     cut: Array
-    child: Index
+    child: Ints
     constants: Array
     jumps: Array
     anchors: Array
@@ -63,7 +60,7 @@ class Cells:
         return self._boxes(np.full(len(self.low), -np.inf), np.full(len(self.low), np.inf))
 
     @property
-    def marked(self) -> npt.NDArray[np.bool_]:
+    def marked(self) -> Bools:
         """(m,): where something jumps."""
         return np.asarray((self.jumps > 0).any(axis=1))
 
@@ -77,21 +74,21 @@ class Cells:
         """(nx, nz): the largest constants of all cells; where nothing jumps they hold across cells as well."""
         return np.asarray(self.constants.max(axis=0))
 
-    def locate(self, z: Array) -> Index:
+    def locate(self, z: Array) -> Ints:
         """(n,) the cell of each point; a point on a shared face belongs to the cell below it."""
         return self._walk(z, z, closed=False)[1]
 
-    def meeting(self, boxes: Interval) -> tuple[Index, Index]:
+    def meeting(self, boxes: Interval) -> tuple[Ints, Ints]:
         """(row, cell) of every cell that holds a point of a box, in order of rows; points belong to cells as in `locate`."""
         return self._walk(boxes.lo, boxes.hi, closed=False)
 
-    def closures(self, z: Array) -> list[Index]:
+    def closures(self, z: Array) -> list[Ints]:
         """Per cell, the rows of z that lie in the closed cell: one on a shared face serves the cells on both sides."""
         rows, leaf = self._walk(z, z, closed=True)
         order = np.argsort(leaf, kind="stable")
         return np.split(rows[order], np.searchsorted(leaf[order], np.arange(1, len(self))))
 
-    def bare(self, domain: Domain, z: Array) -> Index:
+    def bare(self, domain: Domain, z: Array) -> Ints:
         """The cells that may meet Z and whose closure holds none of the points z: nothing is known there."""
         empty = np.array([not len(rows) for rows in self.closures(z)])
         return np.flatnonzero(empty & ~domain.outside(self.boxes))
@@ -105,7 +102,7 @@ class Cells:
         scale = np.maximum(np.abs(r).mean(axis=0), np.finfo(float).tiny)
         weights = (self.constants / scale[:, None]).sum(axis=1)
         boxes = self.boxes
-        heap = [_entry(k, c, boxes.mid[k], boxes.rad[k], weights[c]) for k, c in enumerate(range(len(self)))]
+        heap = [_entry(c, c, boxes.mid[c], boxes.rad[c], weights[c]) for c in range(len(self))]
         heapq.heapify(heap)
         points = list(self.anchors)
         age, most = len(heap), len(points) + budget
@@ -141,11 +138,11 @@ class Cells:
             lo[-1 - child], hi[-1 - child] = a, b
         return Interval(lo, hi)
 
-    def _walk(self, low: Array, high: Array, closed: bool) -> tuple[Index, Index]:
+    def _walk(self, low: Array, high: Array, closed: bool) -> tuple[Ints, Ints]:
         """(row, cell) pairs of rows [low, high] and cells that they meet, by row and then by cell."""
         rows = np.arange(len(low))
         node = np.full(len(low), 0 if len(self.axis) else -1, dtype=np.intp)
-        found: list[tuple[Index, Index]] = []
+        found: list[tuple[Ints, Ints]] = []
         while len(rows):
             leaf = node < 0
             found.append((rows[leaf], -1 - node[leaf]))

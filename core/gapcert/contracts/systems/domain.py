@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 
+from gapcert.contracts.data.inequality import MalformedError, parse
 from gapcert.contracts.systems.system import StateSpec, System
-from gapcert.numerics.arrays import Array
+from gapcert.numerics.arrays import Array, Bools, Ints
 from gapcert.numerics.constraint_zone import Relation as Relation
 from gapcert.numerics.constraint_zone import Zone, centres, grid_at, grid_points, grid_size, lattice
 from gapcert.numerics.errors import UsageError
-from gapcert.numerics.intervals import Interval
+from gapcert.numerics.intervals import Interval, norm
 
 
 @final
@@ -38,21 +38,30 @@ class Box:
                 )
 
     @classmethod
+    def of(cls, axes: tuple[StateSpec, ...], bounds: Mapping[str, Any]) -> Box:
+        """From [low, high] of each axis, by name; `bounds` is its inverse."""
+        return cls(axes, *(tuple(float(bounds[a.name][k]) for a in axes) for k in (0, 1)))
+
+    @classmethod
     def among(cls, axes: tuple[StateSpec, ...], bounds: Mapping[str, Any]) -> Box | None:
         """The box over those axes that have bounds, by name; None where none has."""
         own = tuple(a for a in axes if a.name in bounds)
-        return cls(own, *(tuple(bounds[a.name][k] for a in own) for k in (0, 1))) if own else None
+        return cls.of(own, bounds) if own else None
 
     @property
     def names(self) -> tuple[str, ...]:
         return tuple(a.name for a in self.axes)
 
     @property
+    def bounds(self) -> dict[str, list[float]]:
+        return {a.name: [low, high] for a, low, high in zip(self.axes, self.low, self.high, strict=True)}
+
+    @property
     def interval(self) -> Interval:
         """The box as one Interval of shape (1, axes)."""
         return Interval(np.asarray(self.low)[None], np.asarray(self.high)[None])
 
-    def contains(self, points: Array) -> np.ndarray:
+    def contains(self, points: Array) -> Bools:
         """(n,) booleans: low ≤ point ≤ high on every axis."""
         return np.asarray(((points >= self.low) & (points <= self.high)).all(axis=-1))
 
@@ -95,12 +104,8 @@ class Domain:
             raise UsageError(f"domain: '{unknown[0]}' is no state or input; there are {', '.join(known)}")
         if missing := [n for n in known if n not in ranges]:
             raise UsageError(f"domain: no range for '{missing[0]}'; add {missing[0]}: [low, high]")
-
-        def box(axes: tuple[StateSpec, ...]) -> Box:
-            return Box(axes, tuple(float(ranges[a.name][0]) for a in axes), tuple(float(ranges[a.name][1]) for a in axes))
-
         units = {a.name: a.unit for a in (*system.states, *system.inputs)}
-        return cls(box(system.states), box(system.inputs), tuple(_relations(relations, units)))
+        return cls(Box.of(system.states, ranges), Box.of(system.inputs, ranges), tuple(_relations(relations, units)))
 
     @functools.cached_property
     def zone(self) -> Zone:
@@ -155,7 +160,7 @@ class Domain:
         """(x, u) of points z."""
         return z[..., : self.nx], z[..., self.nx :]
 
-    def contains(self, z: Array) -> np.ndarray:
+    def contains(self, z: Array) -> Bools:
         """(n,) booleans: in the box, and every relation holds."""
         return self.zone.contains(z)
 
@@ -163,7 +168,7 @@ class Domain:
         """n independent points, uniform on Z; a pure function of the generator's state."""
         return self.zone.draw(n, rng)
 
-    def outside(self, boxes: Interval) -> np.ndarray:
+    def outside(self, boxes: Interval) -> Bools:
         """(n,) booleans: the box (n, nz) does not meet Z, for certain."""
         return self.zone.outside(boxes)
 
@@ -185,8 +190,6 @@ class Domain:
 
 
 def _relations(given: Iterable[str | Relation], units: Mapping[str, str]) -> Iterable[Relation]:
-    from gapcert.contracts.data.inequality import MalformedError, parse
-
     for item in given:
         if isinstance(item, Relation):
             yield item
@@ -211,7 +214,7 @@ class Points:
     def chunk(self, start: int, stop: int) -> Array:
         return self.z[start:stop]
 
-    def at(self, index: npt.NDArray[np.int64]) -> Array:
+    def at(self, index: Ints) -> Array:
         """The points of given numbers, (n, nz)."""
         return np.asarray(self.z[index])
 
@@ -240,7 +243,7 @@ class Cover:
     def chunk(self, start: int, stop: int) -> Array:
         return grid_points(self.domain.zone, self.counts, start, stop)
 
-    def at(self, index: npt.NDArray[np.int64]) -> Array:
+    def at(self, index: Ints) -> Array:
         """The points of given numbers (n,), as `chunk` has them: (n, nz)."""
         return grid_at(self.domain.zone, self.counts, index)
 
@@ -262,18 +265,9 @@ class Cover:
             h[list(zone.axes)] = lattice(zone, self.counts).half
         return h
 
-    def radii(self, axes: np.ndarray | None = None) -> tuple[float, float]:
+    def radii(self, axes: Bools | None = None) -> tuple[float, float]:
         """(εx, εu): Euclidean cover radii of the state and the input block, rounded up; over some axes (nz booleans) alone,
         where a function does not change along the others.
         """
-        h = Interval.exact(self.half_widths() if axes is None else np.where(axes, self.half_widths(), 0.0))
-        square = (h * h).hi
-        nx = self.domain.nx
-
-        def root(block: Array) -> float:
-            total = 0.0
-            for s in block:
-                total = float(np.nextafter(total + s, np.inf))
-            return float(np.nextafter(np.sqrt(total), np.inf))
-
-        return root(square[:nx]), root(square[nx:])
+        h = self.half_widths() if axes is None else np.where(axes, self.half_widths(), 0.0)
+        return float(norm(h[: self.domain.nx])), float(norm(h[self.domain.nx :]))

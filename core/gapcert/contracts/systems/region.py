@@ -74,7 +74,7 @@ class Polytope:
         return Interval.dot(Interval(low, high).reshape(len(low), 1, low.shape[1]), self.zone.matrix)
 
     def to_data(self) -> dict[str, Any]:
-        return {"box": bounds_of(self.box), "cuts": [[c.text, list(c.coefficients), c.bound] for c in self.cuts]}
+        return {"box": self.box.bounds, "cuts": [[c.text, list(c.coefficients), c.bound] for c in self.cuts]}
 
 
 @final
@@ -168,7 +168,7 @@ class Ellipsoid:
 
     def to_data(self) -> dict[str, Any]:
         rows = [list(row) for row in self.matrix]
-        return {"box": bounds_of(self.box), "on": list(self.on), "centre": list(self.centre), "matrix": rows}
+        return {"box": self.box.bounds, "on": list(self.on), "centre": list(self.centre), "matrix": rows}
 
 
 @final
@@ -201,7 +201,7 @@ class Region:
 
     def to_data(self) -> Any:
         """JSON-able; a list of boxes where there is nothing else."""
-        boxes = [bounds_of(b) for b in self.boxes]
+        boxes = [b.bounds for b in self.boxes]
         if not self.shapes:
             return boxes
         polytopes, ellipsoids = ([p.to_data() for p in parts] for parts in (self.polytopes, self.ellipsoids))
@@ -211,16 +211,16 @@ class Region:
     def from_data(cls, axes: tuple[StateSpec, ...], data: Any) -> Region:
         """Inverse of `to_data`, bit for bit."""
         if isinstance(data, list):
-            return cls(tuple(box_of(axes, b) for b in data))
+            return cls(tuple(Box.of(axes, b) for b in data))
         polytopes = (
-            Polytope(box_of(axes, p["box"]), tuple(Relation(text, tuple(a), b) for text, a, b in p["cuts"]))
+            Polytope(Box.of(axes, p["box"]), tuple(Relation(text, tuple(a), b) for text, a, b in p["cuts"]))
             for p in data["polytopes"]
         )
         ellipsoids = (
-            Ellipsoid(box_of(axes, e["box"]), tuple(e["on"]), tuple(e["centre"]), tuple(map(tuple, e["matrix"])))
+            Ellipsoid(Box.of(axes, e["box"]), tuple(e["on"]), tuple(e["centre"]), tuple(map(tuple, e["matrix"])))
             for e in data["ellipsoids"]
         )
-        return cls(tuple(box_of(axes, b) for b in data["boxes"]), tuple(polytopes), tuple(ellipsoids))
+        return cls(tuple(Box.of(axes, b) for b in data["boxes"]), tuple(polytopes), tuple(ellipsoids))
 
 
 def _within(box: Box, x: Array, asked: Callable[[Array], Bools]) -> Bools:
@@ -256,11 +256,3 @@ def _turns(box: Box, low: Array, high: Array) -> Iterator[tuple[Array, Array]]:
         t = np.asarray(turns, dtype=np.float64)
         pad = 4 * np.spacing(np.maximum(np.maximum(np.abs(low), np.abs(high)), TURN)) * np.abs(t)
         yield low + t * TURN - pad, high + t * TURN + pad
-
-
-def bounds_of(box: Box) -> dict[str, list[float]]:
-    return {a.name: [low, high] for a, low, high in zip(box.axes, box.low, box.high, strict=True)}
-
-
-def box_of(axes: tuple[StateSpec, ...], bounds: Mapping[str, Any]) -> Box:
-    return Box(axes, tuple(float(bounds[a.name][0]) for a in axes), tuple(float(bounds[a.name][1]) for a in axes))

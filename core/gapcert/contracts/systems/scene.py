@@ -6,9 +6,8 @@ from dataclasses import dataclass, field, replace
 from typing import final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert.numerics.arrays import Array
+from gapcert.numerics.arrays import Array, Ints
 
 GREY = (0.62, 0.65, 0.7, 1.0)
 FACES = 6000
@@ -38,7 +37,7 @@ class Shape:
     place: Array = field(default_factory=at_rest)
     colour: Array = field(default_factory=lambda: np.array(GREY))
     vertices: Array = field(default_factory=lambda: np.empty((0, 3)))
-    faces: npt.NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 3), dtype=np.int64))
+    faces: Ints = field(default_factory=lambda: np.empty((0, 3), dtype=np.int64))
 
     @classmethod
     def of_inertia(cls, link: int, mass: float, moments: Array, place: Array) -> Shape | None:

@@ -9,12 +9,11 @@ from dataclasses import dataclass
 from typing import Any, Literal, final
 
 import numpy as np
-import numpy.typing as npt
 
 from gapcert.contracts.systems.extension import Extension as Extension
 from gapcert.contracts.systems.extension import Parameter as Parameter
 from gapcert.contracts.systems.scene import Scene as Scene
-from gapcert.numerics.arrays import Array
+from gapcert.numerics.arrays import Array, Bools
 from gapcert.numerics.digest import digest
 from gapcert.numerics.errors import UsageError
 from gapcert.numerics.intervals import Interval
@@ -385,7 +384,7 @@ class Model(System, Extendable, EngineHints):
         """∂x⁺/∂(x, u) up to rounding, (nx, nx + nu), NaN where it may vary, at all u or at one (nu,); None: not known."""
         return None
 
-    def unmoved(self, u: Array) -> npt.NDArray[np.bool_]:
+    def unmoved(self, u: Array) -> Bools:
         """(n, nx): states that inputs u (n, nu) leave exactly where they are, whatever the states; False where not known."""
         return np.zeros((len(u), self.nx), dtype=bool)
 

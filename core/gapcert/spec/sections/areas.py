@@ -16,7 +16,7 @@ from gapcert.spec.sections.sections import Bound, Boxes, Section
 from gapcert.spec.text.source import At, Problem
 
 if TYPE_CHECKING:
-    from gapcert.contracts.controllers.automaton import Automaton
+    from gapcert.contracts.controllers.goal import Automaton
 
 
 @final

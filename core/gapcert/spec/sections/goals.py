@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from gapcert.contracts.controllers.automaton import Automaton
-from gapcert.contracts.controllers.goal import Goal
+from gapcert.contracts.controllers.goal import Automaton, Goal
 from gapcert.contracts.data.inequality import parse
 from gapcert.contracts.systems.domain import Box, Domain
 from gapcert.contracts.systems.region import Ellipsoid, Polytope, Region

@@ -1,1 +1,0 @@
-"""What constants bound, and what contradicts them."""
