@@ -182,12 +182,12 @@ from gapcert.run.study import Outcome as Outcome
 from gapcert.run.study import Study as Study
 from gapcert.run.verdict import outside as outside
 from gapcert.run.verdict import share as share
+from gapcert.spec.compose import regular as regular
 from gapcert.spec.models import near as near
 from gapcert.spec.models import unknown_key as unknown_key
 from gapcert.spec.models import validate as validate
 from gapcert.spec.relations import backend_axes as backend_axes
 from gapcert.spec.sections import sections as sections
-from gapcert.spec.sections.config import Config as Config
 from gapcert.spec.sections.plugin_sections import Axes as Axes
 from gapcert.spec.sections.plugin_sections import Checker as Checker
 from gapcert.spec.sections.plugin_sections import Drawn as Drawn
@@ -195,6 +195,7 @@ from gapcert.spec.sections.plugin_sections import Schema as Schema
 from gapcert.spec.sections.plugin_sections import SpecSection as SpecSection
 from gapcert.spec.sections.sections import Bound as Bound
 from gapcert.spec.sections.sections import Boxes as Boxes
+from gapcert.spec.sections.sections import Config as Config
 from gapcert.spec.sections.sections import Count as Count
 from gapcert.spec.sections.sections import Name as Name
 from gapcert.spec.sections.sections import Probability as Probability
@@ -203,11 +204,10 @@ from gapcert.spec.sections.sections import Section as Section
 from gapcert.spec.sections.sections import Share as Share
 from gapcert.spec.sections.sections import Time as Time
 from gapcert.spec.sections.sections import Whole as Whole
+from gapcert.spec.source import At as At
+from gapcert.spec.source import Problem as Problem
+from gapcert.spec.source import read as read
 from gapcert.spec.spec import load_spec as load_spec
-from gapcert.spec.text.compose import regular as regular
-from gapcert.spec.text.source import At as At
-from gapcert.spec.text.source import Problem as Problem
-from gapcert.spec.text.source import read as read
 from gapcert.testing.checks import expect as expect
 from gapcert.testing.signals import multisine as multisine
 from gapcert.testing.toys import PLAIN as PLAIN

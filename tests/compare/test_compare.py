@@ -512,7 +512,7 @@ def test_a_backend_that_cannot_be_built_is_told_at_its_place(tmp_path):
 
 
 def test_the_schema_knows_the_section():
-    from gapcert.spec.editors.schema import schema
+    from gapcert.spec.schema import schema
 
     properties = schema()["else"]["properties"]["compare"]["properties"]
     assert {"backends", "families", "lipschitz", "seeds", "require", "pairs"} == set(properties)

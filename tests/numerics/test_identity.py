@@ -24,6 +24,8 @@ GONE = {
     "gapcert_symbolic.solvers:Fixpoints": "as above",
     "gapcert.diagnosis.asked:Answer": "what a study found is an Outcome, whatever the study",
     "gapcert.events:Stages": "a protocol that only gapcert.run:_Stages had",
+    "gapcert.spec.check:_Ranges": "sections that are one value each are read by one model",
+    "gapcert.spec.cuts:_": "as above",
     "gapcert.testing.hidden.": "the generator of hidden effects is no part of the package any more",
     "gapcert.options:Adjustable": "a protocol of configs, which ConfigContract has among others",
     "gapcert.testing.contact:": "fields that only the suite attacks bounds with are its own",

@@ -84,8 +84,8 @@ def validate(options: Arguments) -> Answer:
 
 
 def schema(options: Arguments) -> Answer:
-    from gapcert.spec.editors import editor
-    from gapcert.spec.editors.schema import schema as make
+    from gapcert.spec import editor
+    from gapcert.spec.schema import schema as make
 
     if options.install is None and not options.modeline:
         made = make()

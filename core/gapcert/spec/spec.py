@@ -16,11 +16,7 @@ from gapcert.contracts.plugins.options import of_config
 from gapcert.contracts.plugins.registry import Registry, registry
 from gapcert.numerics.errors import GapcertError, UsageError
 from gapcert.spec.check import COMPONENTS, SpecChecker
-from gapcert.spec.editors.schema import schema
-from gapcert.spec.expect import evaluate_expectations
-from gapcert.spec.relations import relate
-from gapcert.spec.sections.config import Config
-from gapcert.spec.text.compose import (
+from gapcert.spec.compose import (
     extend,
     inside,
     load_tree,
@@ -32,7 +28,11 @@ from gapcert.spec.text.compose import (
     variant_name,
     variants,
 )
-from gapcert.spec.text.source import Mark, Problem, Source, Tree, failure, failures, parse, plain
+from gapcert.spec.expect import evaluate_expectations
+from gapcert.spec.relations import relate
+from gapcert.spec.schema import schema
+from gapcert.spec.sections.sections import Config
+from gapcert.spec.source import Mark, Problem, Source, Tree, failure, failures, parse, plain
 
 if TYPE_CHECKING:
     from gapcert.contracts.controllers.goal import Goal

@@ -13,10 +13,9 @@ from pydantic import BaseModel
 from gapcert.contracts.plugins.component import load
 from gapcert.contracts.plugins.registry import Registry
 from gapcert.numerics.errors import UsageError
-from gapcert.spec.editors.offers import SECTIONS
 from gapcert.spec.models import validate
-from gapcert.spec.sections.config import Config
-from gapcert.spec.text.source import At, Problem
+from gapcert.spec.sections.sections import SECTIONS, Config
+from gapcert.spec.source import At, Problem
 
 Schema = dict[str, Any]
 

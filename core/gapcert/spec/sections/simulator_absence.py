@@ -7,10 +7,9 @@ from typing import Any
 
 from gapcert.contracts.plugins.options import of_config
 from gapcert.contracts.plugins.registry import Registry
-from gapcert.spec.sections.config import Config
 from gapcert.spec.sections.plugin_sections import SpecSection, simulated
-from gapcert.spec.sections.sections import CertificateConfig
-from gapcert.spec.text.source import Problem
+from gapcert.spec.sections.sections import CertificateConfig, Config
+from gapcert.spec.source import Problem
 
 BESIDE_DECLARED = ("sampling", "symmetries")
 BESIDE_MEASURED = ("sampling", "hidden", "symmetries", "coordinates", "controller")

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gapcert.spec.text.source import At, Key, Mark, Problem, Source, Tree, failure, parse, read
+from gapcert.spec.source import At, Key, Mark, Problem, Source, Tree, failure, parse, read
 from gapcert.spec.thresholds import THRESHOLDS
 
 
