@@ -21,7 +21,7 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
 import gapcert
-from gapcert.cli.licences import licences
+from gapcert.cli.doctor import licences
 from gapcert.contracts.plugins.component import KINDS, Component
 from gapcert.spec.sections import sections
 from gapcert.spec.sections.plugin_sections import contributed

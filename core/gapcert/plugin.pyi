@@ -27,7 +27,7 @@ from gapcert.certification.routes import Request as Request
 from gapcert.certification.routes import Route as Route
 from gapcert.certification.samples.executors import processes as processes
 from gapcert.certification.samples.store import Store as Store
-from gapcert.cli.folders.listing import entry as entry
+from gapcert.cli.listing import entry as entry
 from gapcert.contracts.controllers.automaton import MOST as MOST
 from gapcert.contracts.controllers.automaton import Automaton as Automaton
 from gapcert.contracts.controllers.control import Controller as Controller
@@ -175,11 +175,12 @@ from gapcert.numerics.texts import columns as columns
 from gapcert.numerics.texts import leaves as leaves
 from gapcert.numerics.texts import times as times
 from gapcert.run.build import Build as Build
-from gapcert.run.manifest import stored as stored
+from gapcert.run.folder import stored as stored
 from gapcert.run.progress_rate import figure as figure
+from gapcert.run.run import Outcome as Outcome
+from gapcert.run.run import Study as Study
+from gapcert.run.run import cpu_seconds as cpu_seconds
 from gapcert.run.status import RunFolder as RunFolder
-from gapcert.run.study import Outcome as Outcome
-from gapcert.run.study import Study as Study
 from gapcert.run.verdict import outside as outside
 from gapcert.run.verdict import share as share
 from gapcert.spec.compose import regular as regular
@@ -197,6 +198,7 @@ from gapcert.spec.sections.sections import Bound as Bound
 from gapcert.spec.sections.sections import Boxes as Boxes
 from gapcert.spec.sections.sections import Config as Config
 from gapcert.spec.sections.sections import Count as Count
+from gapcert.spec.sections.sections import HiddenConfig as HiddenConfig
 from gapcert.spec.sections.sections import Name as Name
 from gapcert.spec.sections.sections import Probability as Probability
 from gapcert.spec.sections.sections import Seconds as Seconds

@@ -58,10 +58,9 @@ def relate(
         problems += part.relate(config, data, known, registry)
     own, hidden = _split_domain(config, units)
     config = replace(config, domain=own, hidden=hidden)
-    if hidden is not None:
-        at = ("domain",) if hidden.mode == "augment" else ("hidden", "sample", "ranges")
-        _box(hidden.ranges, at, {}, problems)  # only the backend knows their units
-    if hidden is not None and hidden.mode == "augment":
+    at = ("domain",) if hidden.mode == "augment" else ("hidden", "sample", "ranges")
+    _box(hidden.ranges, at, {}, problems)  # only the backend knows their units
+    if hidden.mode == "augment":
         known = known._replace(states={**known.states, **dict.fromkeys(hidden.ranges, "1")})
     if config.domain is not None:
         problems += _coverage(config.domain, ("domain",), units)
@@ -77,10 +76,10 @@ def relate(
     return config, problems
 
 
-def _split_domain(config: Config, known: Mapping[str, str]) -> tuple[Mapping[str, tuple[Any, Any]] | None, HiddenConfig | None]:
+def _split_domain(config: Config, known: Mapping[str, str]) -> tuple[Mapping[str, tuple[Any, Any]] | None, HiddenConfig]:
     """(domain, hidden): with `augment`, ranges of names that the model does not have are those of hidden states."""
-    hidden: HiddenConfig | None = config.hidden
-    if config.domain is None or hidden is None or hidden.mode != "augment" or not known:
+    hidden = config.hidden
+    if config.domain is None or hidden.mode != "augment" or not known:
         return config.domain, hidden
     own = {n: r for n, r in config.domain.items() if n in known}
     return own, replace(hidden, ranges={n: r for n, r in config.domain.items() if n not in known})

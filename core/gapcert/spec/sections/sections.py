@@ -94,8 +94,7 @@ class Routes:
 
 
 # `quantity`: in which unit editors offer numbers ("": in any).
-_QUANTITY, _SECONDS = (WithJsonSchema({"type": ["number", "string"], "quantity": unit}) for unit in ("", "s"))
-_SHARE = WithJsonSchema({"type": ["number", "string"], "quantity": "%"})
+_QUANTITY, _SECONDS, _SHARE = (WithJsonSchema({"type": ["number", "string"], "quantity": unit}) for unit in ("", "s", "%"))
 Name = Annotated[str, BeforeValidator(_name)]
 RouteName = Annotated[str, BeforeValidator(_route), Routes]
 Bound = Annotated[float | str, BeforeValidator(_bound), _QUANTITY]
@@ -367,7 +366,7 @@ class Config:
     relations: tuple[str, ...] = ()
     coordinates: Mapping[str, str] = field(default_factory=dict)
     symmetries: SymmetriesConfig | None = None
-    hidden: HiddenConfig | None = None
+    hidden: HiddenConfig = HiddenConfig()
     sampling: GridSampling | AdaptiveSampling | LatticeSampling | None = None
     lipschitz: Mapping[str, Any] = field(default_factory=dict)
     gap: Any = None
