@@ -21,9 +21,9 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
 import gapcert
-from gapcert.cli.licences import licences
+from gapcert.cli.doctor import licences
 from gapcert.contracts.plugins.component import KINDS, Component
-from gapcert.spec.sections import areas, cuts, hidden, sections
+from gapcert.spec.sections import sections
 from gapcert.spec.sections.plugin_sections import contributed
 from gapcert_diagnosis.results import ORDER
 
@@ -97,7 +97,7 @@ def option_tables(kind: str) -> str:
     """All components of a kind, or one section of the core's own."""
     if kind not in KINDS:
         more = [sys.modules[type(s).__module__] for s in contributed(gapcert.registry()).values()]
-        home = next(m for m in (sections, areas, cuts, hidden, *more) if hasattr(m, kind))
+        home = next(m for m in (sections, *more) if hasattr(m, kind))
         return option_table(getattr(home, kind).model_json_schema())
     parts, told = [], set[str]()
     for c in components(kind):

@@ -21,6 +21,7 @@ from gapcert.plugin import (
     System,
     UsageError,
     registry,
+    stored,
     write_atomic,
 )
 from gapcert_compare.thresholds import THRESHOLDS
@@ -55,14 +56,11 @@ def answer(simulation: Peer, reality: Peer, laboratory: Laboratory, judge: Judge
     """What separates a robot's engine from another backend; nothing where none can be named. Kept beside the shards."""
     if not isinstance(simulation.system, EngineBackend):
         return Answer()
-    path = laboratory.folder / f"causes-{_question(simulation, reality, laboratory)[:32]}.json"
-    try:
-        kept = json.loads(path.read_text(encoding="utf-8"))
-        if not (isinstance(kept, dict) and {"alternatives", "made", "left"} <= set(kept)):
-            raise ValueError("it holds something else")
-    except (OSError, ValueError, RecursionError):
+    name = f"causes-{_question(simulation, reality, laboratory)[:32]}.json"
+    kept: Any = stored(laboratory.folder, name)
+    if kept is None or not {"alternatives", "made", "left"} <= set(kept):
         kept = plain(asdict(_found(simulation, reality, laboratory, judge, rebuild)))
-        write_atomic(path, json.dumps(kept, indent=1).encode())
+        write_atomic(laboratory.folder / name, json.dumps(kept, indent=1).encode())
     alternatives = tuple(tuple(Change(**c) for c in changes) for changes in kept["alternatives"])
     return Answer(alternatives, kept["made"], kept["left"] and (kept["left"][0], kept["left"][1]))
 

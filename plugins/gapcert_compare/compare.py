@@ -2,24 +2,51 @@
 
 from __future__ import annotations
 
+import csv
 import hashlib
+import io
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
 
 import numpy as np
 
-from gapcert.plugin import Build, Domain, Emit, Event, Model, Outcome, Shown, Stages, Study
+from gapcert.plugin import (
+    Build,
+    Certificate,
+    Domain,
+    Emit,
+    Event,
+    HiddenConfig,
+    MissingDependency,
+    Model,
+    Outcome,
+    Shown,
+    SpecError,
+    Stages,
+    Study,
+    Undecided,
+    UsageError,
+    cpu_seconds,
+    digest,
+    stored,
+    write_atomic,
+)
 from gapcert_compare.thresholds import THRESHOLDS
 from gapcert_figures import Axis, CompareFigure, PairFigure
 
 from .laboratory import Laboratory, Peer, peers
-from .matrix import cells, row
 from .pairs import Pair, Pairs, map_axes
 from .section import CompareConfig
-from .tables import write_tables
+
+FAMILY, ESTIMATOR = "envelope", "wood-zhang"
+"""What certify() takes where the spec names none."""
+ROW = ("backend", "family", "lipschitz", "seed", "tightness", "samples", "cpu_s", "claim", "violations")
+PAIR = ("a", "b", "mean", "max", "state", "relative", "relative_max", "resolved")
+SETTING = ("setting", "value", "was", "on", "reduction", "closes", "made", "effect", "site", "native", "parameters")
 
 
 @final
@@ -71,8 +98,29 @@ class ComparisonStudy(Study):
 
 def _domain(build: Build, peer: Peer, model: Model) -> Domain:
     """Where the pairs meet: states, inputs and relations of the spec, whatever the matrix does about hidden state."""
-    config = replace(build.spec.config, backend=peer.config, hidden=None)
-    return replace(build, spec=replace(build.spec, config=config)).against(model)[1]
+    return build.with_sections(backend=peer.config, hidden=HiddenConfig()).against(model)[1]
+
+
+@final
+@dataclass(frozen=True)
+class Cell:
+    """One combination of the matrix, and the spec that certifies it."""
+
+    backend: str
+    family: str
+    lipschitz: str
+    seed: int
+    build: Build
+
+    @property
+    def place(self) -> Path:
+        """Its folder inside the run folder."""
+        words = (re.sub(r"[^a-z0-9_.=-]+", "-", w.lower()) for w in (self.family, self.lipschitz))
+        return Path("rows", self.backend, "_".join([*words, str(self.seed)]))
+
+    @property
+    def names(self) -> dict[str, Any]:
+        return {"backend": self.backend, "family": self.family, "lipschitz": self.lipschitz, "seed": self.seed}
 
 
 def _rows(
@@ -92,6 +140,60 @@ def _rows(
         best = {"tightest": min(tight)} if tight else {}
         emit(Event("progress", "matrix", {"done": k, "total": len(matrix), "unit": "rows", "best": best}))
     return rows
+
+
+def cells(build: Build, asked: CompareConfig, backends: Iterable[str]) -> Iterator[Cell]:
+    """All combinations over the backends that can be used, in the order of the spec."""
+    config = build.spec.config
+    own = config.lipschitz.get("residual")
+    families = asked.families or {getattr(config.gap, "kind", FAMILY): config.gap}
+    constants = asked.lipschitz or {getattr(own, "kind", ESTIMATOR): own}
+    for name in backends:
+        for family, gap in families.items():
+            for method, residual in constants.items():
+                for seed in asked.seeds or (config.seed,):
+                    lipschitz = {} if residual is None else {**config.lipschitz, "residual": residual}
+                    one = build.with_sections(backend=asked.backends[name], gap=gap, lipschitz=lipschitz, seed=seed)
+                    yield Cell(name, family, method, seed, one)
+
+
+def row(cell: Cell, model: Model, folder: Path, emit: Emit) -> dict[str, Any]:
+    """A certificate in one line; a refused one says why. A finished row of the same question is not made again."""
+    place = folder / cell.place
+    backend, domain = cell.build.against(model)
+    question = digest(model, backend, domain)
+    kept = stored(place, "row.json") or {}  # what is damaged is made again
+    if kept.get("question") == question and isinstance(kept.get("row"), dict):
+        return dict(kept["row"])
+    begin = cpu_seconds()
+    try:
+        certificate = cell.build.certify(model, backend, domain, place, emit)
+    except (UsageError, Undecided, MissingDependency, SpecError) as error:
+        emit(Event("warning", "matrix", {"message": f"{cell.backend}, {cell.family}, {cell.lipschitz}: {error}"}))
+        nothing = dict.fromkeys(("tightness", "samples", "cpu_s", "claim", "violations"))
+        return {**cell.names, **nothing, "refused": str(error)}
+    certificate.save(place)
+    made = {**cell.names, **_figures(certificate), "cpu_s": round(cpu_seconds() - begin, 3)}
+    write_atomic(place / "row.json", json.dumps({"question": question, "row": made}, indent=1).encode())
+    return made
+
+
+def _figures(certificate: Certificate) -> dict[str, Any]:
+    """`tightness` is the mean over resolved states; `samples` are the transitions behind the bound and its constants."""
+    c = certificate.summary()
+    keys = ("tightness", "resolved", "gap_mean", "gamma_mean", "vacuous")
+    states = {name: {k: s.get(k) for k in keys} for name, s in c["states"].items()}
+    found = [s["tightness"] for s in states.values() if s["tightness"] is not None]
+    return {
+        "tightness": sum(found) / len(found) if found else None,
+        "resolved": bool(found),
+        "states": states,
+        "samples": c["samples"]["bound"] + c["samples"]["lipschitz"],
+        "claim": c["claim"]["kind"],
+        "violations": c["audit"]["violations"] + c.get("attack", {}).get("violations", 0),
+        "audit": c["samples"]["audit"],
+        "digests": dict(certificate.digests),
+    }
 
 
 def _digest(rows: Sequence[Mapping[str, Any]], answers: Mapping[str, str]) -> str:
@@ -154,3 +256,42 @@ def _figure(model: Model, laboratory: Laboratory, measured: Sequence[Pair]) -> C
         names = pair.summary["a"], pair.summary["b"], pair.summary["state"], unit
         drawn.append(PairFigure(*names, tuple(axes[k] for k in shown), ", ".join(held), values, drift))
     return CompareFigure(model.period, tuple(drawn))
+
+
+def write_tables(summary: Mapping[str, Any], folder: Path) -> None:
+    """One line per row of the matrix, per pair, and per setting that was named; a pair also has its states and worst point."""
+    rows = [{**{k: r[k] for k in ROW}, **_states(r, ("tightness", "resolved")), **_said(r)} for r in summary["rows"]]
+    rows += [{**dict.fromkeys(ROW), "backend": u["backend"], "unavailable": u["reason"]} for u in summary["unavailable"]]
+    pairs = []
+    for p in summary["pairs"]:
+        where = {f"where {k}": v for k, v in (p["where"] or {}).items()}
+        step = {f"first step by {k}": v for k, v in p.get("first_differing_step", {}).items() if k in ("bits", "resolved")}
+        head = {k: p.get(k) for k in PAIR}
+        pairs.append({**head, **where, **step, **_states(p, ("mean", "max", "resolved")), **_said(p)})
+    settings = [
+        {"a": p["a"], "b": p["b"], "rank": rank, **{k: e.get(k) for k in SETTING}}
+        for p in summary["pairs"]
+        for rank, e in enumerate(p["explained_by"], 1)
+    ]
+    heads = {"rows": ROW, "pairs": PAIR, "settings": ("a", "b", "rank", *SETTING)}
+    for (name, columns), table in zip(heads.items(), (rows, pairs, settings), strict=True):
+        write_atomic(folder / f"{name}.csv", _csv(table, columns).encode())
+
+
+def _states(entry: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:
+    return {f"{k} {name}": s[k] for name, s in entry.get("states", {}).items() for k in keys}
+
+
+def _said(entry: Mapping[str, Any]) -> dict[str, Any]:
+    return {"refused": entry["refused"]} if "refused" in entry else {}
+
+
+def _csv(table: Sequence[Mapping[str, Any]], head: Sequence[str]) -> str:
+    """RFC 4180; numbers with all their digits, mappings and lists as JSON, nothing for None."""
+    columns = list(dict.fromkeys([*head, *(k for line in table for k in line)]))
+    out = io.StringIO()
+    writer = csv.DictWriter(out, columns)
+    writer.writeheader()
+    for line in table:
+        writer.writerow({k: json.dumps(v) if isinstance(v, dict | list) else v for k, v in line.items()})
+    return out.getvalue()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast, final
 
@@ -125,8 +125,7 @@ def peers(build: Build, asked: CompareConfig, model: Model) -> tuple[dict[str, P
 
 def rebuilt(build: Build, config: Any, model: Model) -> System:
     """The backend that a config describes."""
-    spec = replace(build.spec, config=replace(build.spec.config, backend=config))
-    system: System = replace(build, spec=spec).make("backend", model)
+    system: System = build.with_sections(backend=config).make("backend", model)
     return system
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations
 from typing import Any, final
 
 import numpy as np
@@ -95,7 +94,7 @@ class Pairs:
 
     def all(self, peers: Mapping[str, Peer]) -> Iterator[Pair]:
         """Every pair, in the order of the spec."""
-        couples = list(combinations(peers.values(), 2))
+        couples = list(itertools.combinations(peers.values(), 2))
         differ = explained = 0
         for k, (a, b) in enumerate(couples, 1):
             made = self.between(a, b)
@@ -178,11 +177,8 @@ class Pairs:
             d = np.abs(difference(a.system.states, one, other))
             return float((d.mean(axis=0) / m.s).mean()), bool((d.max(axis=0) <= m.e).all())
 
-        pulse, tried, best = (
-            Pulse(self.emit, f"settings of {a.name} and {b.name}", unit="settings"),
-            itertools.count(1),
-            [m.mean],
-        )
+        pulse = Pulse(self.emit, f"settings of {a.name} and {b.name}", unit="settings")
+        tried, best = itertools.count(1), [m.mean]
 
         def attempt(changes: tuple[Change, ...]) -> Trial | None:
             names = " + ".join(f"{c.on}.{c.setting}" for c in changes)

@@ -87,25 +87,6 @@ class CompareConfig:
     unavailable: Mapping[str, str] = field(default_factory=dict)
 
 
-def read_comparison(checker: Checker, section: Any) -> CompareConfig | None:
-    """The typed section, or None; every problem is told at its own place."""
-    at: At = ("compare",)
-    if not isinstance(section, Mapping):
-        checker.say(at, f"found {shown(section)}; expected a mapping", "write compare: {backends: {name: {kind: ...}}}")
-        return None
-    known = ("backends", *ENTRIES, *Rest.model_fields)
-    checker.problems += [unknown_key((*at, k), known) for k in section if k not in known]
-    plain = validate(Rest, {k: v for k, v in section.items() if k in Rest.model_fields}, at, checker.problems)
-    required = plain.require if plain is not None else []
-    backends, unavailable = _backends(checker, section, required)
-    entries = {key: _entries(checker, (*at, key), section[key], kinds) for key, kinds in ENTRIES.items() if key in section}
-    if plain is None or not backends:
-        return None
-    return CompareConfig(
-        backends, **entries, seeds=tuple(plain.seeds or ()), require=tuple(required), pairs=plain.pairs, unavailable=unavailable
-    )
-
-
 def _backends(checker: Checker, section: Mapping[str, Any], required: Sequence[str]) -> tuple[dict[str, Any], dict[str, str]]:
     """Config by name, and why some cannot be used here; a required one that cannot is an error."""
     at: At = ("compare", "backends")
@@ -176,7 +157,26 @@ class CompareSection(SpecSection):
     alone = True
 
     def read(self, checker: Checker, section: Any) -> CompareConfig | None:
-        return read_comparison(checker, section)
+        at: At = ("compare",)
+        if not isinstance(section, Mapping):
+            checker.say(at, f"found {shown(section)}; expected a mapping", "write compare: {backends: {name: {kind: ...}}}")
+            return None
+        known = ("backends", *ENTRIES, *Rest.model_fields)
+        checker.problems += [unknown_key((*at, k), known) for k in section if k not in known]
+        plain = validate(Rest, {k: v for k, v in section.items() if k in Rest.model_fields}, at, checker.problems)
+        required = plain.require if plain is not None else []
+        backends, unavailable = _backends(checker, section, required)
+        entries = {key: _entries(checker, (*at, key), section[key], kinds) for key, kinds in ENTRIES.items() if key in section}
+        if plain is None or not backends:
+            return None
+        return CompareConfig(
+            backends,
+            **entries,
+            seeds=tuple(plain.seeds or ()),
+            require=tuple(required),
+            pairs=plain.pairs,
+            unavailable=unavailable,
+        )
 
     def relate(self, config: Config, data: Mapping[str, Any], axes: Axes, registry: Registry) -> list[Problem]:
         """What does not go with it, backends with other axes than the model's, and axes of its maps that there are not."""

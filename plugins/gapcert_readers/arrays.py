@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, final
@@ -66,11 +67,7 @@ def _open(path: Path, title: str) -> Any:
 
 def _natural(names: Sequence[str]) -> list[str]:
     """demo_2 before demo_10."""
-    return sorted(names, key=lambda n: [int(p) if p.isdigit() else 0 for p in _parts(n)] + [len(n)])
-
-
-def _parts(name: str) -> list[str]:
-    return "".join(c if c.isdigit() else " " for c in name).split()
+    return sorted(names, key=lambda n: [*map(int, re.findall(r"\d+", n)), len(n)])
 
 
 def _below(group: Any, mark: str, turned: bool = False) -> dict[str, Any]:

@@ -1,30 +1,20 @@
 """Options of the readers."""
 
 from pathlib import Path
-from typing import Annotated, Literal, Self, final
+from typing import Literal, Self, final
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema, model_validator
+from pydantic import Field, model_validator
 
-import gapcert as gc
-
-
-def _seconds(value: object) -> float:
-    if (seconds := gc.plugin.magnitude(value, "s")) <= 0:
-        raise ValueError(f"found {value!r}; expected a positive time")
-    return seconds
+from gapcert.plugin import Seconds, Section
 
 
-Seconds = Annotated[float, BeforeValidator(_seconds), WithJsonSchema({"type": ["number", "string"], "quantity": "s"})]
-
-
-class Log(BaseModel):
+class Log(Section):
     """Measurements in files.
 
     files: relative to the spec, with * allowed in the last part; columns: channel of the model → column; units: column →
     unit, where it is not the model's; hold: how the inputs go on between samples; every: the period to resample to.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
     files: list[str] = Field(min_length=1, description="relative to the spec, with * allowed in the last part")
     columns: dict[str, str] = Field(min_length=1, description="channel of the model (output or input) → column of the log")
     units: dict[str, str] = Field({}, description="column → unit, where it is not the model's")

@@ -80,9 +80,6 @@ class FileReader(gc.plugin.Reader):
         given = [n for n in self.config.files if self.folder / n == path]
         return str(given[0]) if given else path.name
 
-    def broken(self, title: str, reason: object) -> gc.UsageError:
-        return broken(title, reason, self.form)
-
 
 def broken(title: str, reason: object, form: str) -> gc.UsageError:
     """The error for a file that is not what it should be."""

@@ -7,7 +7,7 @@ _READERS = (
     ("parquet", "tables:ParquetReader", "Parquet", "Apache Parquet", ()),
     ("hdf5", "arrays:Hdf5Reader", "Hdf5", "HDF5", ("h5py",)),
     ("mat", "arrays:MatReader", "Mat", "MATLAB's .mat, versions 5 to 7.3", ("h5py",)),
-    ("lerobot", "lerobot:LerobotReader", "Lerobot", "LeRobot data sets", ()),
+    ("lerobot", "tables:LerobotReader", "Lerobot", "LeRobot data sets", ()),
     ("mcap", "messages:McapReader", "Mcap", "MCAP with messages of ROS or JSON", ("mcap", "rosbags")),
     ("rosbag2", "messages:Rosbag2Reader", "Rosbag2", "ROS 2 bags", ("rosbags",)),
 )
@@ -15,15 +15,7 @@ _READERS = (
 
 @gapcert.hookimpl
 def gapcert_components() -> list[gapcert.Component]:
-    target = "gapcert_recordings.testing:ReaderContract"
-    return [
-        gapcert.Component("contract", "ReaderContract", "what every reader keeps", target),
-        *_readers(),
-    ]
-
-
-def _readers() -> list[gapcert.Component]:
-    return [
+    readers = [
         gapcert.Component(
             "reader",
             name,
@@ -35,3 +27,5 @@ def _readers() -> list[gapcert.Component]:
         )
         for name, target, config, summary, requires in _READERS
     ]
+    contract = "gapcert_recordings.testing:ReaderContract"
+    return [gapcert.Component("contract", "ReaderContract", "what every reader keeps", contract), *readers]

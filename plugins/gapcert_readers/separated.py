@@ -91,27 +91,24 @@ def line_of(path: Path, row: int) -> int:
 
 def remarks(path: Path) -> int:
     """How many lines that begin with # or % stand above the header, which is the first without, and holds names."""
-    with open(path, encoding="utf-8-sig", errors="replace") as file:
-        for n, line in enumerate(itertools.islice(_bounded(file), THRESHOLDS.preamble_lines)):
-            if line.strip() and not line.lstrip().startswith(("#", "%")):
-                # Where numbers follow, the last remark is the header.
-                return 0 if re.match(r"\s*[-+.\d]", line) else n
+    for n, line in enumerate(itertools.islice(_text(path), THRESHOLDS.preamble_lines)):
+        if line.strip() and not line.lstrip().startswith(("#", "%")):
+            # Where numbers follow, the last remark is the header.
+            return 0 if re.match(r"\s*[-+.\d]", line) else n
     return 0
 
 
 def _lines(path: Path) -> list[str]:
     """The header and the first two rows."""
-    above = remarks(path)
-    with open(path, encoding="utf-8-sig", errors="replace") as file:
-        list(itertools.islice(_bounded(file), above))
-        full = (line.rstrip("\r\n") for line in _bounded(file) if line.strip("\r\n"))
-        return list(itertools.islice(full, 3))
+    below = itertools.islice(_text(path), remarks(path), None)
+    return list(itertools.islice((line.rstrip("\r\n") for line in below if line.strip("\r\n")), 3))
 
 
-def _bounded(file: Any) -> Iterator[str]:
+def _text(path: Path) -> Iterator[str]:
     """Lines of a file that may be anything."""
-    while line := file.readline(1 << 20):
-        yield line
+    with open(path, encoding="utf-8-sig", errors="replace") as file:
+        while line := file.readline(1 << 20):
+            yield line
 
 
 def _split(line: str, mark: str) -> list[str]:
@@ -162,16 +159,15 @@ def _undecoded(table: Any) -> bool:
 def _uneven(path: Path, mark: str) -> gc.UsageError | None:
     """The first line that has another number of values than the header."""
     above, names = remarks(path), 0
-    with open(path, encoding="utf-8-sig", errors="replace") as file:
-        for n, line in enumerate(_bounded(file), 1):
-            if n > above and (text := line.rstrip("\r\n")):
-                count = len(_split(text, mark))
-                names = names or count
-                if count != names:
-                    what = f"line {n} has {count} value{'s' * (count != 1)} ('{text[:60]}')"
-                    todo = "mend it, or remove it if the log was cut off there"
-                    said = f"recording: {path.name} cannot be read: {what}; expected {names}, as the header has; {todo}"
-                    return gc.UsageError(said)
+    for n, line in enumerate(_text(path), 1):
+        if n > above and (text := line.rstrip("\r\n")):
+            count = len(_split(text, mark))
+            names = names or count
+            if count != names:
+                what = f"line {n} has {count} value{'s' * (count != 1)} ('{text[:60]}')"
+                todo = "mend it, or remove it if the log was cut off there"
+                said = f"recording: {path.name} cannot be read: {what}; expected {names}, as the header has; {todo}"
+                return gc.UsageError(said)
     return None
 
 

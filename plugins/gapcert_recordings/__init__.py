@@ -10,8 +10,7 @@ _HOME = homes(
     {
         "gapcert_recordings.experiment": "play",
         "gapcert_recordings.inspect": "Column Table in_words inspect not_numbers sentence",
-        "gapcert_recordings.repairs": "repairs",
-        "gapcert_recordings.resampling": "JITTER Log Piece pieces",
+        "gapcert_recordings.resampling": "JITTER Log Piece pieces repairs",
         "gapcert_recordings.transitions": "Transitions axes",
     }
 )

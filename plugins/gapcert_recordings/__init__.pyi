@@ -5,10 +5,10 @@ from gapcert_recordings.inspect import in_words as in_words
 from gapcert_recordings.inspect import inspect as inspect
 from gapcert_recordings.inspect import not_numbers as not_numbers
 from gapcert_recordings.inspect import sentence as sentence
-from gapcert_recordings.repairs import repairs as repairs
 from gapcert_recordings.resampling import JITTER as JITTER
 from gapcert_recordings.resampling import Log as Log
 from gapcert_recordings.resampling import Piece as Piece
 from gapcert_recordings.resampling import pieces as pieces
+from gapcert_recordings.resampling import repairs as repairs
 from gapcert_recordings.transitions import Transitions as Transitions
 from gapcert_recordings.transitions import axes as axes

@@ -11,7 +11,7 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert import Array, MissingDependency, StateSpec, Trajectory, UsageError
+from gapcert import Array, MissingDependency, Recording, StateSpec, Trajectory, UsageError
 from gapcert.plugin import SHORTEST, Reader, as_numbers, first_text, harmless, seconds, stated_units
 
 from .resampling import Log, pieces, readings
@@ -83,7 +83,8 @@ def inspect(path: Path | str) -> tuple[Table, ...]:
     if not where.exists():
         raise UsageError(f"{path}: there is no such file; expected a log, a folder with one, or a spec that names one")
     if where.suffix in (".yaml", ".yml"):
-        return tuple(map(_trajectory, *_of_spec(where)))
+        recording = _recorded(where)
+        return tuple(_described(tr.name, "t", tr.t, tr.channels, recording.units) for tr in recording.trajectories)
     readers = _readers(where)
     for reader in readers:
         if found := [_table(name, columns, partial(reader.place, where)) for name, columns in reader.tables(where)]:
@@ -91,14 +92,13 @@ def inspect(path: Path | str) -> tuple[Table, ...]:
     raise UsageError(f"{path}: nothing in it is a table of numbers; expected a log; `gapcert plugins` lists the readers")
 
 
-def _of_spec(path: Path) -> tuple[tuple[Trajectory, ...], list[Mapping[str, str]]]:
+def _recorded(path: Path) -> Recording:
     from gapcert.plugin import load_spec
 
     spec = load_spec(path)
     if spec.config.recording is None:
         raise UsageError(f"{path}: the spec has no recording; expected a log, or a spec with `recording:`")
-    recording = spec.recorded()
-    return recording.trajectories, [recording.units] * len(recording.trajectories)
+    return spec.recorded()
 
 
 def _readers(path: Path) -> list[type[Reader]]:
@@ -150,10 +150,6 @@ def _unit(times: Array) -> str:
                 return unit
         return "ns"
     return "s"
-
-
-def _trajectory(tr: Trajectory, units: Mapping[str, str]) -> Table:
-    return _described(tr.name, "t", tr.t, tr.channels, units)
 
 
 def _described(name: str, time: str | None, t: Array, columns: Mapping[str, Array], units: Mapping[str, str]) -> Table:

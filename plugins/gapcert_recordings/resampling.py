@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, final
@@ -11,14 +11,14 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.plugin import SHORTEST, Array, Bools, Hold, StateSpec, Trajectory, UsageError
+from gapcert.plugin import SHORTEST, TURN, Array, Bools, Hold, StateSpec, Trajectory, UsageError, times
 from gapcert_recordings.thresholds import THRESHOLDS
 
 from .smoothing import absurd, filled_in, noise_floor, smoothed
-from .unwrapping import counted
 
 Rows = npt.NDArray[np.intp]
 JITTER = 1e-3  # of the sampling period: below that, samples are evenly spaced
+SHOWN = 3  # places of a kind that are told
 
 
 @final
@@ -195,8 +195,45 @@ def _columns(
         out[:, j] = readings(tr.channels[spec.name][rows], fills)
     for j, spec in enumerate(specs):
         if spec.kind == "angle":
-            out[:, j] = counted(out[:, j], t, tr.period, out[:, rates[j]] if j in rates else None)
+            out[:, j] = unwrapped(out[:, j], t, tr.period, out[:, rates[j]] if j in rates else None)
     return out
+
+
+def unwrapped(values: Array, t: Array, dt: float, rate: Array | None = None) -> Array:
+    """Angles (T,) at times t (T,), `dt` apart, without jumps by whole turns; NaN stays. rate (T,): measured, in rad/s.
+
+    From sample to sample an angle moves by less than half a turn. Over a hole it may turn several times: a log that counts
+    turns itself is taken at its word, else the turn nearest to where the rate leads is meant.
+    """
+    rows = np.flatnonzero(np.isfinite(values))
+    if len(rows) < 2:
+        return values
+    holes = 1 + np.flatnonzero((np.diff(rows) > 1) | (np.diff(t[rows]) > THRESHOLDS.hole_step * dt))
+    runs = [rows[a:b] for a, b in itertools.pairwise([0, *holes.tolist(), len(rows)])]
+    out = values.copy()
+    for run in runs:
+        out[run] = np.unwrap(values[run])
+    wraps = any(np.abs(out[run] - values[run]).max() > 1 for run in runs)
+    if not wraps and np.ptp(values[rows]) > TURN:
+        return values
+    for before, after in itertools.pairwise(runs):
+        expected = out[before[-1]] + _moved(out, t, dt, before, after, rate, wraps)
+        out[after] += TURN * np.round((expected - out[after[0]]) / TURN)
+    return out
+
+
+def _moved(angle: Array, t: Array, dt: float, before: Rows, after: Rows, rate: Array | None, turns: bool) -> float:
+    """By how much an angle moved over a hole: by its measured rate, else at the speed of both ends if it is one that turns."""
+    a, b = int(before[-1]), int(after[0])
+    inner = slice(a + 1, b)
+    if rate is not None and np.isfinite(rate[inner]).sum() >= ((t[b] - t[a]) / dt - 1) / 2:
+        known = np.flatnonzero(np.isfinite(rate))
+        at = np.arange(a, b + 1)
+        return float(np.trapezoid(np.interp(at, known, rate[known]), t[at])) if len(known) else 0.0
+    ends = [run for run in (before[-THRESHOLDS.hole_ends :], after[: THRESHOLDS.hole_ends]) if len(run) > 1]
+    if not turns or not ends:
+        return 0.0
+    return float(t[b] - t[a]) * float(np.mean([(angle[e[-1]] - angle[e[0]]) / (t[e[-1]] - t[e[0]]) for e in ends]))
 
 
 def _despiked(u: Array, names: Sequence[str], log: Log) -> Array:
@@ -335,3 +372,36 @@ def _thinned(piece: Piece, dt: float, every: float) -> Piece:
     offset = piece.offset[row] + dt * late
     knots = piece.knots / ratio
     return Piece(t, piece.y[row], piece.weight[row], offset, smooth, slope, knots, piece.u, piece.noise)
+
+
+def repairs(log: Mapping[str, Any]) -> Iterator[str]:
+    """A clause each for what is not as it was logged, from a `Log` as plain data; nothing for a clean one."""
+    if resets := log.get("resets"):
+        yield f"the clock is set back{_places(resets)}, where the recording is cut"
+    if gaps := log.get("gaps"):
+        yield f"time jumps ahead{_places(gaps)}, where the recording is cut"
+    if cuts := log.get("cuts"):
+        yield f"an input moved unseen{_places(cuts)}, where the recording is cut"
+    if n := log.get("duplicates"):
+        yield f"{times(n, 'row')} whose time is missing or does not go forward {_are(n)} left out"
+    if n := log.get("dropped"):
+        yield f"{times(n, 'row')} {_are(n)} missing, and bridged"
+    if log.get("stamps") == "ignored":
+        yield "times are taken for those of arrival, and replaced by even ones"
+    for key, what in (("outliers", "far outside of everything around"), ("missing", "missing")):
+        yield from (f"{times(n, 'value')} of {name} {_are(n)} {what}, and left out" for name, n in log.get(key, {}).items())
+    yield from (
+        f"{times(n, 'reading')} of {name} {_are(n)} far outside of everything else, and replaced"
+        for name, n in log.get("repaired", {}).items()
+    )
+    if seconds := log.get("unused"):
+        yield f"{seconds:.3g} s are in stretches too short or too empty to be used"
+
+
+def _places(found: Sequence[Mapping[str, Any]]) -> str:
+    said = ", ".join(f"{f['at']:.6g} s" for f in found[:SHOWN])
+    return f" {len(found)} times (first at {said})" if len(found) > SHOWN else f" at {said}"
+
+
+def _are(n: int) -> str:
+    return "are" if n > 1 else "is"

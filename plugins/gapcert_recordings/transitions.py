@@ -42,10 +42,8 @@ class Transitions:
             raise UsageError(f"{caller}: the log's inputs go in straight lines (hold: first), and γ is about held ones")
         units = {s.name: s.unit for s in (*model.states, *model.inputs)}
         recording = recording.converted({n: units[n] for n in recording.units if n in units})
-        parts = [
-            (i, piece, _steps(piece, names, model)) for i, tr in enumerate(recording.trajectories) for piece in _forward(tr)
-        ]
-        rows = [(i, *found) for i, _, found in parts if len(found[0])]
+        parts = [(i, *_steps(piece, names, model)) for i, tr in enumerate(recording.trajectories) for piece in _forward(tr)]
+        rows = [part for part in parts if len(part[1])]
         if not rows:
             periods = sorted({f"{tr.period:.4g}" for tr in recording.trajectories})
             raise UsageError(

@@ -18,7 +18,7 @@ from gapcert.numerics.intervals import Interval
 from gapcert.numerics.order_statistics import STREAM, points_needed, surprising
 from gapcert.testing.toys import Drift, Perturbed, ripple
 from gapcert_calibrate.route import CalibratedGap, NoConstants, ends
-from gapcert_compare.matrix import _figures
+from gapcert_compare.compare import _figures
 from gapcert_verify.verify import verify_run
 
 Array = np.ndarray

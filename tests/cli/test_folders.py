@@ -14,17 +14,16 @@ from pathlib import Path
 import pytest
 
 import gapcert as gc
-from gapcert.cli.folders.cleaning import remove, seconds, size
-from gapcert.cli.folders.listing import entry, sized
-from gapcert.cli.folders.watching import Follower
+from gapcert.cli.cleaning import remove, seconds, size
+from gapcert.cli.listing import entry, sized
 from gapcert.cli.main import main
 from gapcert.cli.terminal import Terminal
+from gapcert.cli.watching import Follower
 from gapcert.contracts.plugins.events import BEAT, Event, Heart, Pulse
 from gapcert.numerics.errors import UsageError
 from gapcert.run import journal
+from gapcert.run.folder import alive, enter, myself, owned, owner, spec_of
 from gapcert.run.journal import Journal
-from gapcert.run.lock import alive, myself, owned, owner
-from gapcert.run.manifest import enter, spec_of
 from gapcert.run.progress_rate import Pace, counted, duration, speed
 from gapcert.run.status import RunFolder, standing
 from gapcert_compare.run_folders import Figure, change, compare

@@ -7,7 +7,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from gapcert.cli.licences import licences
+from gapcert.cli.doctor import licences
 from gapcert.cli.main import main
 
 PERMISSIVE = re.compile(

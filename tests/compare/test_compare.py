@@ -346,7 +346,7 @@ def test_the_same_spec_again_makes_no_row_and_no_sample_again(done):
 
 def test_another_question_in_a_row_is_not_taken_over(done, tmp_path):
     """A kept row is of this question: another backend under the same name makes its own."""
-    from gapcert_compare.matrix import cells, row
+    from gapcert_compare.compare import cells, row
 
     loaded = load_spec(spec({"semi": SEMI}))
     build = Build(loaded, None, tmp_path, False)
@@ -512,7 +512,7 @@ def test_a_backend_that_cannot_be_built_is_told_at_its_place(tmp_path):
 
 
 def test_the_schema_knows_the_section():
-    from gapcert.spec.editors.schema import schema
+    from gapcert.spec.schema import schema
 
     properties = schema()["else"]["properties"]["compare"]["properties"]
     assert {"backends", "families", "lipschitz", "seeds", "require", "pairs"} == set(properties)

@@ -13,11 +13,10 @@ from gapcert.contracts.plugins.events import silent
 from gapcert.run.build import Build
 from gapcert.spec.spec import load_spec
 from gapcert_compare import causes
-from gapcert_compare.compare import closed
+from gapcert_compare.compare import closed, write_tables
 from gapcert_compare.laboratory import Given, Laboratory, peers
 from gapcert_compare.pairs import Pairs
 from gapcert_compare.settings import Change, Trial, explain
-from gapcert_compare.tables import write_tables
 from gapcert_report.words.compare import setting_name
 
 pytestmark = pytest.mark.contract

@@ -136,7 +136,7 @@ def test_errors_stand_at_their_place(lines, place, says):
 
 
 def test_both_sections_are_part_of_the_schema():
-    from gapcert.spec.editors.schema import schema
+    from gapcert.spec.schema import schema
 
     properties = schema()["else"]["properties"]
     assert properties["relations"]["type"] == "array"

@@ -10,8 +10,8 @@ from pydantic import BaseModel, Field
 
 import gapcert
 from gapcert.contracts.plugins.component import KINDS
-from gapcert.spec.editors.schema import schema
-from gapcert.spec.sections import areas, cuts, hidden, sections
+from gapcert.spec.schema import schema
+from gapcert.spec.sections import sections
 from gapcert.spec.sections.plugin_sections import contributed
 from gapcert_calibrate import config as stochastic
 from gapcert_engines import model_config as engine
@@ -53,7 +53,7 @@ def test_every_kind_is_in_the_reference_with_all_its_options(tables):
 CONTRIBUTED = {sys.modules[type(s).__module__] for s in contributed(gapcert.registry()).values()}
 MODELS = [
     m
-    for module in (areas, cuts, engine, hidden, sections, stochastic, *CONTRIBUTED)
+    for module in (engine, sections, stochastic, *CONTRIBUTED)
     for m in vars(module).values()
     if isinstance(m, type) and issubclass(m, BaseModel) and m.__module__ == module.__name__ and m.__name__ not in WRAPPERS
 ]

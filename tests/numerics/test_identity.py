@@ -24,6 +24,9 @@ GONE = {
     "gapcert_symbolic.solvers:Fixpoints": "as above",
     "gapcert.diagnosis.asked:Answer": "what a study found is an Outcome, whatever the study",
     "gapcert.events:Stages": "a protocol that only gapcert.run:_Stages had",
+    "gapcert.spec.check:_Ranges": "sections that are one value each are read by one model",
+    "gapcert.spec.cuts:_": "as above",
+    "gapcert.spec.editor:_Commented": "an error that was caught where it was raised",
     "gapcert.testing.hidden.": "the generator of hidden effects is no part of the package any more",
     "gapcert.options:Adjustable": "a protocol of configs, which ConfigContract has among others",
     "gapcert.testing.contact:": "fields that only the suite attacks bounds with are its own",
@@ -77,7 +80,7 @@ def test_every_class_is_found_by_the_name_that_it_had():
     names = [f"{module}:{name}" for module, names in stored("classes.json").items() for name in names]
     left = [name for name in names if not name.startswith(tuple(GONE))]
     assert [name for name in left if identity(located(name, PACKAGES)) != name] == []
-    assert len(left) > 680
+    assert len(left) > 650
 
 
 @pytest.mark.contract

@@ -47,7 +47,7 @@ def test_the_check_above_can_fail():
 
 @pytest.mark.run
 def test_the_options_of_all_plugins_are_light():
-    assert HEAVY & loaded_by("from gapcert.spec.editors.schema import schema; schema()") == {"pydantic", "ruamel"}
+    assert HEAVY & loaded_by("from gapcert.spec.schema import schema; schema()") == {"pydantic", "ruamel"}
 
 
 def cpu(*arguments):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gapcert.cli.main import main
-from gapcert_recordings.repairs import repairs
+from gapcert_recordings.resampling import repairs
 
 SPEC = """version: 1
 name: rod

@@ -6,7 +6,7 @@ import pytest
 from gapcert import Recording
 from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.testing import ROD, equations
-from gapcert_recordings.unwrapping import counted
+from gapcert_recordings.resampling import unwrapped
 
 PERIOD = 0.005
 T = np.arange(800) * PERIOD
@@ -29,32 +29,32 @@ def same(found, angle=ANGLE):
 
 
 def test_a_log_that_counts_its_turns_is_taken_at_its_word():
-    same(counted(holed(ANGLE), T, PERIOD))
+    same(unwrapped(holed(ANGLE), T, PERIOD))
     # Where it swings back, no speed tells.
     swinging = 20 * np.sin(2 * np.pi * 0.6 * T)
-    same(counted(holed(swinging), T, PERIOD), swinging)
+    same(unwrapped(holed(swinging), T, PERIOD), swinging)
 
 
 def test_a_wrapped_angle_is_unwrapped_over_a_hole_at_its_speed():
-    same(counted(wrapped(ANGLE), T, PERIOD))
-    same(counted(holed(wrapped(ANGLE)), T, PERIOD, SPEED))
-    same(counted(holed(wrapped(ANGLE)), T, PERIOD))  # that at its ends, which differ little
+    same(unwrapped(wrapped(ANGLE), T, PERIOD))
+    same(unwrapped(holed(wrapped(ANGLE)), T, PERIOD, SPEED))
+    same(unwrapped(holed(wrapped(ANGLE)), T, PERIOD))  # that at its ends, which differ little
 
 
 def test_a_measured_speed_tells_more_than_the_ends_of_a_hole():
     speed = np.where((T > 1.5) & (T < 1.9), 80.0, 10.0)  # turns fast while it is not seen
     angle = np.concatenate([[0], np.cumsum(speed[:-1] + speed[1:]) / 2 * PERIOD])
-    same(counted(holed(wrapped(angle)), T, PERIOD, speed), angle)
+    same(unwrapped(holed(wrapped(angle)), T, PERIOD, speed), angle)
 
 
 def test_an_angle_that_never_turned_stays_within_its_turn():
     swinging = 1.5 * np.sin(2 * np.pi * 0.5 * T + 1)
-    assert np.array_equal(counted(holed(swinging), T, PERIOD), holed(swinging), equal_nan=True)
+    assert np.array_equal(unwrapped(holed(swinging), T, PERIOD), holed(swinging), equal_nan=True)
 
 
 def test_rows_that_are_lost_are_a_hole_as_well():
     keep = np.delete(np.arange(len(T)), np.arange(HOLE.start, HOLE.stop))
-    same(counted(wrapped(ANGLE)[keep], T[keep], PERIOD), ANGLE[keep])
+    same(unwrapped(wrapped(ANGLE)[keep], T[keep], PERIOD), ANGLE[keep])
 
 
 @pytest.mark.parametrize("log", [ANGLE, wrapped(ANGLE)], ids=["counted", "wrapped"])

@@ -8,7 +8,7 @@ import pytest
 import gapcert as gc
 from gapcert.cli.main import main
 from gapcert.contracts.plugins.registry import Registry, installed
-from gapcert.spec.editors.schema import schema
+from gapcert.spec.schema import schema
 
 MODEL = {"kind": "equations", "states": {"x": "1"}, "inputs": {"u": "1"}, "period": "1 s", "next": {"x": "0.5*x + u"}}
 PLAIN = {"version": 1, "name": "plain", "model": MODEL}

@@ -7,7 +7,7 @@ from pydantic import BaseModel
 
 from gapcert import GapcertError, MissingDependency, SpecError, load_spec
 from gapcert.spec.models import validate
-from gapcert.spec.text.source import Problem
+from gapcert.spec.source import Problem
 
 # what is replaced, by what (‸ marks where the error stands), or line:column, the sentence, the hint
 BROKEN = {

@@ -12,7 +12,7 @@ from yaml_server import Server
 
 from gapcert.cli.main import main
 from gapcert.cli.scaffold.scaffold import scaffold
-from gapcert.spec.editors import editor
+from gapcert.spec import editor
 
 ROOT = Path(__file__).parents[2]
 SPECS = sorted((ROOT / "specs").rglob("*.yaml"))

@@ -12,9 +12,9 @@ import pytest
 from gapcert import Domain, MissingDependency, SpecError, StateSpec, UsageError, load_spec
 from gapcert.contracts.data.units import magnitude
 from gapcert.contracts.systems.domain import Box
-from gapcert.spec.editors.schema import schema
-from gapcert.spec.expect import parse_key
-from gapcert.spec.spec import Spec, evaluate_expectations
+from gapcert.spec.expect import evaluate_expectations, parse_key
+from gapcert.spec.schema import schema
+from gapcert.spec.spec import Spec
 
 
 @pytest.fixture

@@ -4,14 +4,33 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from gapcert.cli.folders.commands import FOLDERS
-from gapcert.contracts.plugins.component import EXECUTED, SET, SPEC, Answer, Argument, Arguments, Component
-from gapcert.numerics.errors import UsageError
+from gapcert.contracts.plugins.component import ALLOW_CODE, EXECUTED, SET, SPEC, Answer, Argument, Arguments, Component
+from gapcert.numerics.errors import GapcertError, UsageError
 
+ORDERS = ("age", "name", "kind", "state", "size", "seconds")
+WORDS = (
+    *("running", "finished", "interrupted", "failed", "holds", "fails", "unknown"),
+    *("causes", "ambiguous", "nothing", "unexplained", "agree", "explained", "differ", "compared"),
+)
+_TICK: Mapping[str, Any] = {"action": "store_true"}
+_CHOSEN = (
+    Argument("--out", "where the run folders are (runs)", {"type": Path, "default": Path("runs"), "metavar": "DIR"}),
+    Argument(
+        "--name",
+        "names or folders such as 'pendulum*'; may be repeated",
+        {"action": "append", "default": [], "metavar": "PATTERN"},
+    ),
+    Argument(
+        "--state",
+        f"one of {', '.join(WORDS)}; may be repeated",
+        {"action": "append", "default": [], "metavar": "WORD", "choices": WORDS},
+    ),
+    Argument("--sort", f"one of {', '.join(ORDERS)}", {"default": "age", "choices": ORDERS, "metavar": "BY"}),
+)
 _KINDS = "model, backend, gap_family, lipschitz, synthesizer, effect, reader, executor, observer or study"
 
 
@@ -46,10 +65,38 @@ COMMANDS = (
     _command(
         "doctor",
         "say what this machine can do",
-        Argument("--paste", "as a short block to paste into a report of a fault", {"action": "store_true"}),
-        Argument("--licences", "the licence of every package that is needed, and by what", {"action": "store_true"}),
+        Argument("--paste", "as a short block to paste into a report of a fault", _TICK),
+        Argument("--licences", "the licence of every package that is needed, and by what", _TICK),
     ),
-    *FOLDERS,
+    _command("runs", "list, compare, clean and resume run folders", *_CHOSEN),
+    _command("runs list", "run folders with state, figures and size (what `gapcert runs` alone does)", *_CHOSEN, does="runs"),
+    _command(
+        "runs clean",
+        "which run folders would go; with --yes they do",
+        *_CHOSEN,
+        Argument("--older-than", "such as 30min, 12h, 7d, 2w", {"metavar": "AGE"}),
+        Argument("--larger-than", "such as 100MB, 2GB", {"metavar": "SIZE"}),
+        Argument("--keep-last", "keep the newest N of each name", {"default": 0, "type": int, "metavar": "N"}),
+        Argument("--all", "every folder that nothing else leaves out", _TICK),
+        Argument("--yes", "remove them", _TICK),
+        does="clean",
+    ),
+    _command(
+        "runs resume",
+        "go on with an interrupted run from its folder alone",
+        Argument("RUN", "the folder of a run"),
+        Argument("--executor", "another executor than the run was begun with", {"metavar": "NAME"}),
+        ALLOW_CODE,
+        Argument("--view", "open a live Rerun viewer", _TICK),
+        Argument("--quiet -q", "no progress", _TICK),
+        does="resume",
+    ),
+    _command(
+        "watch",
+        "follow a run from its folder: stage, rate, remaining time, best so far",
+        Argument("RUN", "the folder of a run"),
+        Argument("--keep", "where the run dies, wait until it is resumed", _TICK),
+    ),
 )
 
 
@@ -83,8 +130,8 @@ def validate(options: Arguments) -> Answer:
 
 
 def schema(options: Arguments) -> Answer:
-    from gapcert.spec.editors import editor
-    from gapcert.spec.editors.schema import schema as make
+    from gapcert.spec import editor
+    from gapcert.spec.schema import schema as make
 
     if options.install is None and not options.modeline:
         made = make()
@@ -121,12 +168,10 @@ def _listed(data: object, words: Iterable[str]) -> Answer:
 
 
 def doctor(options: Arguments) -> Answer:
-    from gapcert.cli.doctor import examine, pasted
+    from gapcert.cli.doctor import examine, licences, pasted
     from gapcert.numerics.texts import columns
 
     if options.licences:
-        from gapcert.cli.licences import licences
-
         rows = licences()
         table = [(r.package, r.version or "-", r.licence or "not stated", ", ".join(r.needed_by)) for r in rows]
         return Answer([r.facts() for r in rows], columns(("package", "version", "licence", "needed by"), table))
@@ -138,3 +183,88 @@ def doctor(options: Arguments) -> Answer:
     parts = [(c["kind"], c["name"], "yes" if c["available"] else c["reason"]) for c in found["components"]]
     words = [*columns(("machine", ""), facts), "", *columns(("package", "version"), packages), ""]
     return _listed(found, [*words, *columns(("component", "", "available"), parts)])
+
+
+def runs(options: Arguments) -> Answer:
+    from gapcert.cli.listing import chosen, entry, table
+
+    rows = [entry(r) for r in chosen(options.out, options.name, options.state, options.sort)]
+    none = f"no run folders in {options.out}" + (" that match" if options.name or options.state else "")
+    return Answer(rows, table(rows) if rows else [none])
+
+
+def clean(options: Arguments) -> Answer:
+    from gapcert.cli.cleaning import Choice, remove, seconds, size
+    from gapcert.cli.listing import chosen, condition, entry, sized
+    from gapcert.numerics.texts import times
+
+    asked = (options.name, options.state, options.older_than, options.larger_than, options.keep_last, options.all)
+    if not any(asked):
+        raise UsageError(
+            "gapcert runs clean: nothing says which folders; give --state, --name, --older-than, --larger-than, --keep-last "
+            "or --all"
+        )
+    if options.keep_last < 0:
+        raise UsageError(f"--keep-last: found {options.keep_last}; expected a number from 0 on")
+    older = None if options.older_than is None else seconds(options.older_than)
+    larger = None if options.larger_than is None else size(options.larger_than)
+    choice = Choice(older, larger, options.keep_last)
+    goes, stays = choice.of(chosen(options.out, options.name, options.state, options.sort))
+    rows, failed = [entry(r) for r in goes], list[dict[str, str]]()
+    if options.yes:
+        for run in goes:
+            try:
+                remove(run)
+            except GapcertError as error:
+                failed.append({"run_dir": str(run.path), "reason": str(error)})
+    lost = {f["run_dir"] for f in failed}
+    gone = [r for r in rows if r["run_dir"] not in lost]
+    total = sum(r["size_bytes"] for r in gone)
+    kept = [{"run_dir": str(r.path), "reason": why} for r, why in stays] + failed
+    data = {"removed": options.yes, "folders": gone, "size_bytes": total, "kept": kept}
+    verb = "removed" if options.yes else "would go"
+    words = [f"{verb}: {r['run_dir']} ({condition(r)}, {sized(r['size_bytes'])})" for r in gone]
+    words += [f"stays: {k['run_dir']}: {k['reason']}" for k in kept]
+    words += [f"{times(len(gone), 'folder')}, {sized(total)}" + ("" if options.yes or not gone else "; --yes removes them")]
+    return Answer(data, words, UsageError.exit_code if failed else 0)
+
+
+def resume(options: Arguments) -> Answer:
+    from gapcert.cli.terminal import Terminal
+    from gapcert.contracts.plugins.presentation import view
+    from gapcert.run.run import resume as go_on
+    from gapcert.run.status import RunFolder
+
+    over = RunFolder.at(options.run).standing.state == "finished"
+    how: dict[str, Any] = {k: getattr(options, k) for k in ("executor", "allow_code", "view")}
+    with Terminal(sys.stderr, options.quiet) as terminal:
+        done = go_on(options.run, observers=[terminal], **how)
+    head = [f"{options.run}: has finished already; nothing was run"] if over else []
+    return Answer(done.summary, [*head, *view("Run").lines(done.summary)], done.exit_code)
+
+
+def watch(options: Arguments) -> Answer:
+    from gapcert.cli.terminal import Terminal
+    from gapcert.cli.watching import follow, sentence, show
+    from gapcert.contracts.plugins.presentation import view
+    from gapcert.run.status import RunFolder, Standing
+
+    run, last = RunFolder.at(options.run), None
+    with Terminal(sys.stderr) as terminal:
+        for found in follow(run, options.keep):
+            if isinstance(found, Standing):
+                last = found
+                terminal.over()
+                terminal.line(sentence(run.path, found), always=True)
+            elif options.json:
+                print(json.dumps(found, ensure_ascii=False), flush=True)
+            else:
+                show(terminal, found)
+    assert last is not None, "following ends with a standing"
+    code = 0 if last.exit_code is None else last.exit_code
+    summary = RunFolder.at(options.run).summary if last.state == "finished" else {}
+    if options.json:
+        end = {"event": "watched", "state": last.state, "verdict": last.verdict, "exit_code": code, "summary": summary}
+        print(json.dumps(end, ensure_ascii=False), flush=True)
+        return Answer(None, (), code)
+    return Answer(None, view("Run").lines(summary), code)

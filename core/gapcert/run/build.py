@@ -45,12 +45,16 @@ class Build:
     def make(self, section: str, model: Model | None = None, period: float | None = None) -> Any:
         return self.spec.build(section, model=model, allow_code=self.allow_code, period=period)
 
+    def with_sections(self, **sections: Any) -> Build:
+        """The same of a spec with these in place of its own."""
+        return replace(self, spec=replace(self.spec, config=replace(self.spec.config, **sections)))
+
     def against(self, model: Model) -> tuple[System, Domain]:
         """The backend and the domain of a model."""
         c = self.spec.config
         backend: System = self.make("backend" if c.backend is not None else "reality", model)
-        ranges, hidden = dict(c.domain or {}), c.hidden
-        if hidden is None or hidden.mode != "augment":
+        ranges = dict(c.domain or {})
+        if c.hidden.mode != "augment":
             return backend, Domain.of(model, ranges, c.relations)
         added = self.hidden_ranges(backend, "domain")
         backend, model = augment(backend, list(added)), augment_model(model, backend, list(added))
@@ -61,15 +65,15 @@ class Build:
         the default of all hidden state.
         """
         config = self.spec.config.hidden
-        if config is not None and config.mode == "default":
+        if config.mode == "default":
             return unmeasured(model, backend, [s.name for s in model.hidden])
-        return unmeasured(model, backend, config.ranges if config is not None and config.mode == "sample" else ())
+        return unmeasured(model, backend, config.ranges if config.mode == "sample" else ())
 
     def hidden_ranges(self, backend: System, section: str) -> dict[str, tuple[float, float]]:
         """Declared ranges of hidden states in the backend's units."""
         config, units = self.spec.config.hidden, {h.name: h.unit for h in backend.hidden}
         out: dict[str, tuple[float, float]] = {}
-        for name, bounds in (config.ranges if config is not None else {}).items():
+        for name, bounds in config.ranges.items():
             if name not in units and self.hidden_later:
                 continue
             if name not in units:
@@ -85,8 +89,8 @@ class Build:
     def plan(self, backend: System) -> HiddenPlan:
         """What the spec wants done about hidden state."""
         config = self.spec.config.hidden
-        if config is None or config.mode != "sample":
-            return HiddenPlan(config.mode if config is not None else "refuse")
+        if config.mode != "sample":
+            return HiddenPlan(config.mode)
         assert config.sample is not None, "mode sample comes from a section that says how"
         ranges, pool = self.hidden_ranges(backend, "hidden.sample.ranges"), config.sample.visited
         if pool is None:

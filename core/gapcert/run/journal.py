@@ -19,7 +19,7 @@ from typing import Any, final
 
 from gapcert.contracts.plugins.events import Event, Heart
 from gapcert.numerics.errors import INTERRUPTED, GapcertError, exit_code
-from gapcert.run.lock import myself
+from gapcert.run.folder import myself
 from gapcert.run.thresholds import THRESHOLDS
 from gapcert.version import __version__
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import resource
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,14 +24,12 @@ from gapcert.contracts.systems.system import Model
 from gapcert.numerics.atomic_files import write_atomic
 from gapcert.numerics.errors import Undecided, UsageError
 from gapcert.run.build import Build
+from gapcert.run.folder import enter, opened, owned, place, spec_of
 from gapcert.run.journal import Journal
-from gapcert.run.lock import owned
-from gapcert.run.manifest import enter, opened, place
-from gapcert.run.study import Outcome, Study
-from gapcert.run.verdict import beside_nominal, nothing_won, refutations
-from gapcert.spec.spec import Spec, evaluate_expectations, load_spec
-
-_EXIT = {"holds": 0, "fails": 1, "unknown": 5}
+from gapcert.run.status import RunFolder
+from gapcert.run.verdict import beside_nominal, code_of, nothing_won, refutations
+from gapcert.spec.expect import evaluate_expectations
+from gapcert.spec.spec import Spec, load_spec
 
 
 @final
@@ -72,12 +71,29 @@ class Run(Shown):
     @property
     def exit_code(self) -> int:
         """With `expect:` 0 if all are met, else 1; without, by the verdict (diagnosis and comparison: 0, whatever found)."""
-        if self.runs:
-            return max(r.exit_code for r in self.runs)
-        expectations = self.summary.get("expectations", [])
-        if expectations:
-            return 0 if all(e["met"] for e in expectations) else 1
-        return _EXIT.get(self.summary["verdict"], 0)
+        return max(r.exit_code for r in self.runs) if self.runs else code_of(self.summary)
+
+
+@final
+@dataclass(frozen=True)
+class Outcome:
+    """What was found: the JSON summary, the objects behind it by name, and in a sentence each what refutes a claim."""
+
+    summary: Mapping[str, Any]
+    artifacts: Mapping[str, Any] = field(default_factory=dict)
+    failures: tuple[str, ...] = ()
+
+
+class Study(ABC):
+    """A component of kind `study`, called like the section of a spec that asks for it."""
+
+    @abstractmethod
+    def run(self, build: Build, folder: Path, stages: Stages, made: Outcome) -> Outcome:
+        """Carry it out in a run folder, and say what it adds.
+
+        Where its section answers `alone`, `made` is empty and the summary has `verdict` and `reason`; else it is what the
+        certificate's own run has made, with artifacts model, backend, domain, certificate and controllers.
+        """
 
 
 def run(
@@ -97,53 +113,64 @@ def run(
     loaded = spec if isinstance(spec, Spec) else load_spec(spec, overrides)
     if executor is not None:
         named(executor)
-    made = [_run_one(s, Path(out), executor, allow_code, observers, view, loaded.members) for s in loaded.expand()]
+    builds = [Build(s, executor, Path(out), allow_code) for s in loaded.expand()]
+    made = [_run_one(build, observers, view, loaded.members) for build in builds]
     return Run(Path(out), {"runs": [r.summary for r in made]}, runs=tuple(made)) if loaded.is_matrix else made[0]
 
 
-def _run_one(
-    spec: Spec, out: Path, executor: str | None, allow_code: bool, observers: Sequence[Emit], view: bool, matrix: Sequence[Spec]
+def resume(
+    folder: Path | str,
+    *,
+    executor: str | None = None,
+    allow_code: bool = False,
+    observers: Sequence[Emit] = (),
+    view: bool = False,
 ) -> Run:
-    folder = opened(spec, out)
+    """Go on with an interrupted or failed run, to the same digests as without interruption; a finished one is returned.
+
+    executor: another one than the run was begun with. UsageError where the folder is none of a run, where a process runs in it,
+    or where the files of its spec have changed.
+    """
+    found = RunFolder.at(folder)
+    if found.standing.state == "running":
+        pid = (found.standing.owner or {}).get("pid")
+        raise UsageError(f"{folder}: process {pid} runs it already; follow it with: gapcert watch {folder}")
+    if found.standing.state == "finished" and "verdict" in found.summary:
+        return Run(found.path, found.summary)
+    chosen = executor if executor is not None else found.mark.get("executor")
+    home = found.path if found.path.name else found.path.resolve()
+    return run(spec_of(found.path), out=home.parent, executor=chosen, allow_code=allow_code, observers=observers, view=view)
+
+
+def _run_one(build: Build, observers: Sequence[Emit], view: bool, matrix: Sequence[Spec]) -> Run:
+    folder = opened(build.spec, build.out)
     with owned(folder), Journal(folder) as journal:
-        enter(folder, spec, executor)
+        enter(folder, build.spec, build.executor_name)
         if matrix:
-            beside = [{"folder": place(s, out).name, "values": dict(s.variant)} for s in matrix]
+            beside = [{"folder": place(s, build.out).name, "values": dict(s.variant)} for s in matrix]
             write_atomic(folder / "matrix.json", json.dumps(beside, indent=1, default=str).encode())
-        done = _execute(spec, out, folder, executor, allow_code, journal, observers, view)
+        done = _execute(build, folder, journal, observers, view)
         journal.finished(done.summary, done.exit_code)
         return done
 
 
-def _execute(
-    spec: Spec,
-    out: Path,
-    folder: Path,
-    executor: str | None,
-    allow_code: bool,
-    journal: Journal,
-    observers: Sequence[Emit],
-    view: bool,
-) -> Run:
+def _execute(build: Build, folder: Path, journal: Journal, observers: Sequence[Emit], view: bool) -> Run:
+    spec = build.spec
     tell = broadcast(journal, *observers, *registry().observers())
     for part in registry().of("illustrator"):
         tell = part.load()(folder, tell)
     stages = Stages(tell)
     rerun = str(folder / "run.rrd") if spec.config.report.rerun else None
-    stages.emit(
-        Event(
-            "run-started", "run", {"name": spec.config.name, "spec": spec.data, "folder": folder, "rerun": rerun, "view": view}
-        )
-    )
-    begin = _cpu()
-    build = Build(spec, executor, out, allow_code)
+    told = {"name": spec.config.name, "spec": spec.data, "folder": folder, "rerun": rerun, "view": view}
+    stages.emit(Event("run-started", "run", told))
+    begin = cpu_seconds()
     try:
         made = _answer(build, stages, folder)
     except Undecided as error:
         made = Run(folder, {"verdict": "unknown", "reason": str(error)})
     except UsageError as error:
         raise spec.placed(error) from None
-    timings = {**stages.timings, "cpu": round(_cpu() - begin, 3)}
+    timings = {**stages.timings, "cpu": round(cpu_seconds() - begin, 3)}
     summary = {"name": spec.config.name, "run_dir": str(folder), **made.summary, "timings": timings}
     # The verdict is about claims only; expectations are answered beside it.
     if spec.config.expect:
@@ -178,7 +205,8 @@ def _study(name: str) -> Study:
     return study
 
 
-def _cpu() -> float:
+def cpu_seconds() -> float:
+    """Of this process, and of its children that have ended."""
     return sum(u.ru_utime + u.ru_stime for u in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)))
 
 

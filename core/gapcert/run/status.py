@@ -12,11 +12,11 @@ from typing import Any, Literal, final
 
 from gapcert.numerics.errors import INTERRUPTED
 from gapcert.run import journal
+from gapcert.run.folder import SPEC, alive, is_run, marked, owner, stored
 from gapcert.run.journal import Line
-from gapcert.run.lock import alive, owner
-from gapcert.run.manifest import SPEC, is_run, marked, stored
 from gapcert.run.progress_rate import Pace
 from gapcert.run.thresholds import THRESHOLDS
+from gapcert.run.verdict import code_of
 
 State = Literal["running", "finished", "interrupted", "failed"]
 STATES: tuple[State, ...] = ("running", "finished", "interrupted", "failed")
@@ -85,26 +85,21 @@ def _part(line: Line) -> tuple[str, str]:
 
 
 def standing(folder: Path) -> Standing:
-    """Looks at the mark of whoever holds the lock and at the journal; takes no lock."""
-    mark, lines = owner(folder), tuple(journal.read(folder / journal.NAME))
+    """Looks at what the lock says and at the journal; takes no lock."""
+    holder, lines = owner(folder), tuple(journal.read(folder / journal.NAME))
     last = lines[-1] if lines else None
     ended = last is not None and last["event"] == "run-ended"
-    seen = alive(mark) if mark is not None else False
+    seen = alive(holder) if holder is not None else False
     # Elsewhere nobody can see the process: a fresh report speaks for it.
     if seen or (seen is None and last is not None and not ended and time.time() - last["t"] < THRESHOLDS.lost_run):
-        return Standing("running", lines, mark)
+        return Standing("running", lines, holder)
     if last is not None and ended:
         state: State = last["how"] if last.get("how") in STATES else "failed"
         return Standing(state, lines, None, last.get("verdict"), last.get("exit_code"), str(last.get("reason", "")))
     if last is None and (summary := stored(folder, "summary.json")) is not None:
-        return Standing("finished", lines, None, summary.get("verdict"), _code(folder, summary))
+        code = code_of(summary) if "verdict" in summary else None
+        return Standing("finished", lines, None, summary.get("verdict"), code)
     return Standing("interrupted", lines, None, None, INTERRUPTED)
-
-
-def _code(folder: Path, summary: Mapping[str, Any]) -> int | None:
-    from gapcert.run.run import Run
-
-    return Run(folder, summary).exit_code if "verdict" in summary else None
 
 
 @final

@@ -1,4 +1,4 @@
-"""From evidence to verdict: what refutes the claims of a run, in sentences."""
+"""From evidence to verdict: what refutes the claims of a run, in sentences, and with which exit code it ends."""
 
 from __future__ import annotations
 
@@ -37,6 +37,13 @@ def refutations(certificate: Certificate, asked: CertificateConfig | None) -> li
     elif refuted and not out:
         out.append(refuted)
     return out
+
+
+def code_of(summary: Mapping[str, Any]) -> int:
+    """The exit code of a finished run: by its expectations, or else by its verdict."""
+    if expectations := summary.get("expectations"):
+        return 0 if all(e["met"] for e in expectations) else 1
+    return {"fails": 1, "unknown": 5}.get(summary["verdict"], 0)
 
 
 def outside(witness: Mapping[str, Any]) -> str:

@@ -14,16 +14,13 @@ from gapcert.contracts.plugins.component import Component
 from gapcert.contracts.plugins.options import of_config
 from gapcert.contracts.plugins.registry import Registry
 from gapcert.numerics.errors import GapcertError, clipped
+from gapcert.spec.compose import crowded, matching, near_file, regular
 from gapcert.spec.expect import key_problem
 from gapcert.spec.models import near, unknown_key, validate
 from gapcert.spec.sections import sections as s
-from gapcert.spec.sections.areas import GoalConfig
-from gapcert.spec.sections.config import Config
-from gapcert.spec.sections.hidden import HINT, WORDS, HiddenConfig, Sampled
 from gapcert.spec.sections.plugin_sections import contributed
 from gapcert.spec.sections.simulator_absence import measured
-from gapcert.spec.text.compose import crowded, matching, near_file, regular
-from gapcert.spec.text.source import At, Problem, Tree, dotted
+from gapcert.spec.source import At, Problem, Tree, dotted
 
 # Which kinds of component may stand in a section.
 COMPONENTS: dict[str, tuple[str, ...]] = {
@@ -44,6 +41,13 @@ PLAIN: dict[str, type[BaseModel]] = {
 }
 SAMPLING: dict[str, type[BaseModel]] = {"grid": s.GridSampling, "adaptive": s.AdaptiveSampling, "lattice": s.LatticeSampling}
 BOUNDED = ("residual", "network", "expression")
+# Section: what it has to be, that in words, and how it is written.
+SHAPES: dict[str, tuple[type, str, str]] = {
+    "lipschitz": (Mapping, "a mapping", "write lipschitz: {residual: {kind: ...}}"),
+    "relations": (list, "a list of texts", "write relations: [abs(u - v) <= 0.5, ...]"),
+    "coordinates": (Mapping, "a mapping", "write coordinates: {dx: ux - vx, ...}"),
+    "expect": (Mapping, "a mapping", 'write expect: {verdict: holds, "path <=": 1}'),
+}
 Absent = Callable[[str], bool]
 
 
@@ -55,18 +59,12 @@ class _Head(s.Section):
 
 
 @final
-class _Ranges(s.Section):
-    ranges: s.Boxes
+class _Values(s.Section):
+    """Sections that are no mapping of options: `domain` is still in the units in which it was written."""
 
-
-@final
-class _Relations(s.Section):
-    relations: list[str] = Field(min_length=1)
-
-
-@final
-class _Coordinates(s.Section):
-    coordinates: dict[str, str] = Field(min_length=1)
+    domain: s.Boxes = Field({})
+    relations: list[str] = Field([], min_length=1)
+    coordinates: dict[str, str] = Field({}, min_length=1)
 
 
 @final
@@ -82,7 +80,7 @@ class SpecChecker:
     def say(self, path: At, message: str, hint: str = "", where: Literal["key", "value"] = "value") -> None:
         self.problems.append(Problem(path, message, hint, where))
 
-    def config(self) -> Config | None:
+    def config(self) -> s.Config | None:
         """The typed spec; sections with problems are left out, and None stands for what is no mapping at all."""
         data = self.tree.data
         if not isinstance(data, dict):
@@ -91,25 +89,30 @@ class SpecChecker:
         readers: dict[str, Callable[[str, Any], Any]] = {
             **dict.fromkeys(PLAIN, lambda name, section: validate(PLAIN[name], section, (name,), self.problems)),
             **dict.fromkeys((k for k in COMPONENTS if "." not in k), lambda name, section: self.component((name,), section)),
-            "domain": self.domain,
+            **dict.fromkeys(_Values.model_fields, self.value),
             "sampling": self.sampling,
             "lipschitz": self.lipschitz,
             "expect": self.expect,
-            "relations": self.relations,
-            "coordinates": self.coordinates,
             "hidden": self.hidden,
             **{name: lambda key, section: self.contributed[key].read(self, section) for name in self.contributed},
         }
         head = tuple(_Head.model_fields)
         self.problems += [unknown_key((k,), (*head, *readers, "extends", "matrix")) for k in data if k not in (*head, *readers)]
         top = validate(_Head, {k: data[k] for k in head if k in data}, (), self.problems)
-        parts = {name: read(name, data[name]) for name, read in readers.items() if name in data}
+        parts = {k: read(k, data[k]) for k, read in readers.items() if k in data and self.shaped(k, data[k])}
         if isinstance(data.get("controller"), dict):
             parts["goal"] = self.goal(data["controller"])
         given = {k: v for k, v in parts.items() if v is not None}
         more = {k: given.pop(k) for k in self.contributed if k in given}
         study = next((k for k in more if self.contributed[k].alone), "recording" if measured(data, self.contributed) else "")
-        return Config(name=top.name if top else "", seed=top.seed if top else 0, sections=more, study=study, **given)
+        return s.Config(name=top.name if top else "", seed=top.seed if top else 0, sections=more, study=study, **given)
+
+    def shaped(self, name: str, section: Any) -> bool:
+        """Has a section the shape that it has to have?"""
+        kind, what, hint = SHAPES.get(name, (object, "", ""))
+        if not isinstance(section, kind):
+            self.say((name,), f"found {shown(section)}; expected {what}", hint)
+        return isinstance(section, kind)
 
     def component(self, path: At, section: Any, kinds: tuple[str, ...] = (), absent: Absent | None = None) -> Any:
         """A section whose `kind` is a plugin's: its config, with its own checks made.
@@ -219,10 +222,7 @@ class SpecChecker:
                 self.say(place, f"no plugin provides executor '{name}'", near(name, executors))
         return config
 
-    def lipschitz(self, _: str, section: Any) -> dict[str, Any] | None:
-        if not isinstance(section, Mapping):
-            self.say(("lipschitz",), f"found {shown(section)}; expected a mapping", "write lipschitz: {residual: {kind: ...}}")
-            return None
+    def lipschitz(self, _: str, section: Mapping[str, Any]) -> dict[str, Any]:
         self.problems += [unknown_key(("lipschitz", k), BOUNDED) for k in section if k not in BOUNDED]
         return {k: self.component(("lipschitz", k), v) for k, v in section.items() if k in BOUNDED}
 
@@ -230,52 +230,29 @@ class SpecChecker:
         if "goal" not in controller:
             self.say(("controller",), "missing required key 'goal'", "add goal: {invariance: {state: [low, high]}}", "key")
             return None
-        config = validate(GoalConfig, controller["goal"], ("controller", "goal"), self.problems)
+        config = validate(s.GoalConfig, controller["goal"], ("controller", "goal"), self.problems)
         if config is not None:
             self.files(("controller", "goal"), config)
         return config
 
-    def domain(self, name: str, section: Any) -> dict[str, Any] | None:
-        """Named ranges, still in the units in which they were written."""
-        found: list[Problem] = []
-        config = validate(_Ranges, {"ranges": section}, (), found)
-        self.problems += [Problem((name, *p.path[1:]), p.message, p.hint, p.where) for p in found]
-        return None if config is None else dict(config.ranges)
+    def value(self, name: str, section: Any) -> Any:
+        config = validate(_Values, {name: section}, (), self.problems)
+        found = None if config is None else getattr(config, name)
+        return tuple(found) if isinstance(found, list) else found
 
-    def relations(self, _: str, section: Any) -> tuple[str, ...] | None:
-        """Linear relations between states and inputs, as texts."""
-        if not isinstance(section, list):
-            self.say(
-                ("relations",), f"found {shown(section)}; expected a list of texts", "write relations: [abs(u - v) <= 0.5, ...]"
-            )
-            return None
-        config = validate(_Relations, {"relations": section}, (), self.problems)
-        return None if config is None else tuple(config.relations)
-
-    def coordinates(self, _: str, section: Any) -> dict[str, str] | None:
-        """Names of what stands in place of the inputs, each with a text such as `ux - vx`."""
-        if not isinstance(section, dict):
-            self.say(("coordinates",), f"found {shown(section)}; expected a mapping", "write coordinates: {dx: ux - vx, ...}")
-            return None
-        config = validate(_Coordinates, {"coordinates": section}, (), self.problems)
-        return None if config is None else config.coordinates
-
-    def hidden(self, _: str, section: Any) -> HiddenConfig | None:
+    def hidden(self, _: str, section: Any) -> s.HiddenConfig | None:
         """A word, or a mapping with `sample`."""
         if isinstance(section, Mapping):
-            made = validate(Sampled, section, ("hidden",), self.problems)
-            return None if made is None else HiddenConfig("sample", made.sample, dict(made.sample.ranges or {}))
-        if section in WORDS:
-            return HiddenConfig(section)
-        hint = near(section, WORDS) if isinstance(section, str) else ""
-        what = f"found {shown(section)}; expected {', '.join(WORDS)} or a mapping with sample"
-        self.say(("hidden",), what, hint if hint.startswith("did") else HINT)
+            made = validate(s.Sampled, section, ("hidden",), self.problems)
+            return None if made is None else s.HiddenConfig("sample", made.sample, dict(made.sample.ranges or {}))
+        if section in s.HIDDEN_WORDS:
+            return s.HiddenConfig(section)
+        hint = near(section, s.HIDDEN_WORDS) if isinstance(section, str) else ""
+        what = f"found {shown(section)}; expected {', '.join(s.HIDDEN_WORDS)} or a mapping with sample"
+        self.say(("hidden",), what, hint if hint.startswith("did") else s.HIDDEN_HINT)
         return None
 
-    def expect(self, _: str, section: Any) -> dict[str, Any] | None:
-        if not isinstance(section, Mapping):
-            self.say(("expect",), f"found {shown(section)}; expected a mapping", 'write expect: {verdict: holds, "path <=": 1}')
-            return None
+    def expect(self, _: str, section: Mapping[str, Any]) -> dict[str, Any]:
         for key, value in section.items():
             if (message := key_problem(key, value)) is not None:
                 self.say(("expect", key), message, where="key")

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 
 from gapcert.contracts.data.units import shown
 from gapcert.numerics.errors import GapcertError
-from gapcert.spec.text.source import At, Problem
+from gapcert.spec.source import At, Problem
 
 _TYPES = {
     "int": "a whole number",

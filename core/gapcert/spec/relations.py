@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from gapcert.contracts.data.units import grouped, magnitude
 from gapcert.contracts.plugins.options import of_config
-from gapcert.contracts.plugins.registry import Registry
-from gapcert.spec.models import unknown_key
-from gapcert.spec.sections.areas import GoalConfig, in_units
-from gapcert.spec.sections.config import Config
-from gapcert.spec.sections.cuts import cut_problems
-from gapcert.spec.sections.hidden import HiddenConfig
+from gapcert.contracts.plugins.registry import Registry, registry
+from gapcert.numerics.errors import UsageError
+from gapcert.spec.models import near, unknown_key
 from gapcert.spec.sections.plugin_sections import Axes, SpecSection
-from gapcert.spec.sections.sections import GridSampling, LatticeSampling
+from gapcert.spec.sections.sections import GOALS, Config, Cut, GoalConfig, GridSampling, HiddenConfig, Round, Targeted
 from gapcert.spec.sections.simulator_absence import declared, declared_problems, measured, measured_problems, unasked
-from gapcert.spec.text.source import At, Problem
+from gapcert.spec.source import At, Problem
+
+if TYPE_CHECKING:
+    from gapcert.contracts.controllers.goal import Automaton
+    from gapcert.numerics.constraint_zone import Relation
 
 NEEDS = {
     "certificate": ("model", "backend", "domain"),
@@ -44,43 +45,41 @@ def relate(
     given = {name: section for name, section in more.items() if name in data}
     problems = _needs(data, registry, more) + _period(config, given) + _claims(config, data, registry, more)
     problems += declared_problems(config, data, registry, more)
-    states, inputs = axes(config.model, data.get("model"))
+    known = axes(config.model, data.get("model"))
     for section in ("backend", "reality"):
-        problems += backend_axes(data.get(section), Axes(states, inputs), registry, (section,), getattr(config, section))
-    problems += measured_problems(config, data, {**states, **inputs}, more)
+        problems += backend_axes(data.get(section), known, registry, (section,), getattr(config, section))
+    units = {**known.states, **known.inputs}
+    problems += measured_problems(config, data, units, more)
     first, *others = [name for name, section in given.items() if section.alone] or [""]
     for name in others:
         told = f"'{name}' does not go with '{first}'"
         problems.append(Problem((name,), told, f"write it in a spec of its own, or {name}: null", "key"))
     for part in given.values():
-        problems += part.relate(config, data, Axes(states, inputs), registry)
-    units = {**states, **inputs}
+        problems += part.relate(config, data, known, registry)
     own, hidden = _split_domain(config, units)
     config = replace(config, domain=own, hidden=hidden)
-    if hidden is not None:
-        at = ("domain",) if hidden.mode == "augment" else ("hidden", "sample", "ranges")
-        _box(hidden.ranges, at, {}, problems)  # only the backend knows their units
-    if hidden is not None and hidden.mode == "augment":
-        states = {**states, **dict.fromkeys(hidden.ranges, "1")}
+    at = ("domain",) if hidden.mode == "augment" else ("hidden", "sample", "ranges")
+    _box(hidden.ranges, at, {}, problems)  # only the backend knows their units
+    if hidden.mode == "augment":
+        known = known._replace(states={**known.states, **dict.fromkeys(hidden.ranges, "1")})
     if config.domain is not None:
         problems += _coverage(config.domain, ("domain",), units)
         config = replace(config, domain=_box(config.domain, ("domain",), units, problems))
-    if isinstance(config.sampling, GridSampling | LatticeSampling) and config.sampling.counts is not None and units:
-        problems += _coverage(config.sampling.counts, ("sampling", "counts"), units)
-    if isinstance(config.sampling, GridSampling) and config.sampling.cells is not None and units:
-        problems += _coverage(config.sampling.cells, ("sampling", "cells"), units)
-    problems += cut_problems(config, states, inputs)
+    for option in ("counts", "cells"):
+        if (numbers := getattr(config.sampling, option, None)) is not None:
+            problems += _coverage(numbers, ("sampling", option), units)
+    problems += _cuts(config, known)
     for section in ("controller", "gap"):
-        problems += _keyed(getattr(config, section), data.get(section), (section,), Axes(states, inputs))
+        problems += _keyed(getattr(config, section), data.get(section), (section,), known)
     if config.goal is not None:
-        config = replace(config, goal=_goal(config.goal, states, inputs, config.domain or {}, problems))
+        config = replace(config, goal=_goal(config.goal, known, config.domain or {}, problems))
     return config, problems
 
 
-def _split_domain(config: Config, known: Mapping[str, str]) -> tuple[Mapping[str, tuple[Any, Any]] | None, HiddenConfig | None]:
+def _split_domain(config: Config, known: Mapping[str, str]) -> tuple[Mapping[str, tuple[Any, Any]] | None, HiddenConfig]:
     """(domain, hidden): with `augment`, ranges of names that the model does not have are those of hidden states."""
-    hidden: HiddenConfig | None = config.hidden
-    if config.domain is None or hidden is None or hidden.mode != "augment" or not known:
+    hidden = config.hidden
+    if config.domain is None or hidden.mode != "augment" or not known:
         return config.domain, hidden
     own = {n: r for n, r in config.domain.items() if n in known}
     return own, replace(hidden, ranges={n: r for n, r in config.domain.items() if n not in known})
@@ -95,18 +94,18 @@ def _period(config: Config, given: Mapping[str, SpecSection]) -> list[Problem]:
     return [Problem(("model",), "missing required key 'period'", "add period:, such as 5 ms", "key")]
 
 
-def axes(config: Any, section: Any) -> tuple[Units, Units]:
+def axes(config: Any, section: Any) -> Axes:
     """Names and units of a model's states and inputs: what its config's `axes()` says, else what its section declares.
 
     A coordinate `q` stands for the states `q` and `q_dot`. Empty where the section does not tell.
     """
     if (told := of_config(config, "axes")) is not None:
-        return dict(told[0]), dict(told[1])
+        return Axes(dict(told[0]), dict(told[1]))
     if not isinstance(section, Mapping):
-        return {}, {}
+        return Axes({}, {})
     coordinates = _units(section.get("coordinates"))
     speeds = {f"{q}_dot": "1/s" if unit == "1" else f"{grouped(unit)}/s" for q, unit in coordinates.items()}
-    return {**coordinates, **speeds, **_units(section.get("states"))}, _units(section.get("inputs"))
+    return Axes({**coordinates, **speeds, **_units(section.get("states"))}, _units(section.get("inputs")))
 
 
 def _units(given: Any) -> Units:
@@ -171,8 +170,7 @@ def backend_axes(section: Any, of_model: Axes, registry: Registry, at: At, confi
     if component is not None and component.of:
         inner = None if config is None else config.of
         return found + backend_axes(section.get("of"), of_model, registry, (*at, "of"), inner)
-    have_states, have_inputs = axes(config, section)
-    for key, have, want in (("states", have_states, of_model.states), ("inputs", have_inputs, of_model.inputs)):
+    for key, have, want in zip(Axes._fields, axes(config, section), of_model, strict=True):
         if have and want:
             place = key if key in section else "coordinates"
             found += _coverage(have, (*at, place), want, what=f"the model's {key}")
@@ -197,11 +195,9 @@ def _keyed(config: Any, section: Any, at: At, of_model: Axes) -> list[Problem]:
             found += [unknown_key((*path, n), want, key.axes.removesuffix("s")) for n in have if want and n not in want]
         if key.values == "ranges":
             _box(have, path, units, found)
-        for name, value in have.items() if key.values == "quantities" else ():
-            try:
-                magnitude(value, units.get(name, "1")) if name in units else None
-            except ValueError as error:
-                found.append(Problem((*path, name), str(error)))
+        for name in have if key.values == "quantities" else ():
+            if name in units:
+                _number(have[name], units[name], (*path, name), found)
     return found
 
 
@@ -222,26 +218,27 @@ def _coverage(have: Mapping[str, Any], path: At, want: Units, what: str = "the m
     return found
 
 
+def _number(value: Any, unit: str, at: At, problems: list[Problem]) -> float | None:
+    """A quantity in a unit; None, and a problem, where it is none."""
+    try:
+        return magnitude(value, unit)
+    except ValueError as error:
+        problems.append(Problem(at, str(error)))
+        return None
+
+
 def _box(box: Mapping[str, tuple[Any, Any]], path: At, units: Units, problems: list[Problem]) -> Ranges:
     """A box in the model's units; an unknown unit is checked for finiteness and order only."""
     out: Ranges = {}
     for name, (low, high) in box.items():
-        bounds = []
-        for i, value in enumerate((low, high)):
-            if name not in units and isinstance(value, str):
-                continue
-            try:
-                bounds.append(magnitude(value, units.get(name, "1")))
-            except ValueError as error:
-                problems.append(Problem((*path, name, i), str(error)))
-        if len(bounds) == 2:
-            if bounds[0] >= bounds[1]:
-                state = "empty" if bounds[0] == bounds[1] else "inverted"
-                problems.append(
-                    Problem((*path, name), f"[{_short(low)}, {_short(high)}] is {state}; expected [low, high] with low < high")
-                )
-            else:  # what is wrong itself is no measure for others
-                out[name] = (bounds[0], bounds[1])
+        ends = [(i, end) for i, end in enumerate((low, high)) if name in units or not isinstance(end, str)]
+        bounds = [b for i, end in ends if (b := _number(end, units.get(name, "1"), (*path, name, i), problems)) is not None]
+        if len(bounds) == 2 and bounds[0] >= bounds[1]:
+            state = "empty" if bounds[0] == bounds[1] else "inverted"
+            told = f"[{_short(low)}, {_short(high)}] is {state}; expected [low, high] with low < high"
+            problems.append(Problem((*path, name), told))
+        elif len(bounds) == 2:  # what is wrong itself is no measure for others
+            out[name] = (bounds[0], bounds[1])
     return out
 
 
@@ -249,43 +246,148 @@ def _short(bound: Any) -> str:
     return bound if isinstance(bound, str) else f"{bound:g}"
 
 
-def _goal(
-    goal: GoalConfig, states: Units, inputs: Units, domain: Mapping[str, tuple[Any, Any]], problems: list[Problem]
-) -> GoalConfig:
+def _goal(goal: GoalConfig, axes: Axes, domain: Mapping[str, tuple[Any, Any]], problems: list[Problem]) -> GoalConfig:
     """The goal in the model's units; each of its boxes lies in the domain, and obstacles at least touch it."""
+    at: At = ("controller", "goal")
 
-    def boxed(box: Mapping[str, Any], path: At, within: bool) -> Ranges:
-        return _state_box(box, path, states, inputs, domain, within, problems)
+    def boxed(box: Mapping[str, Any], path: At, within: bool) -> Any:
+        return _state_box(box, path, axes, domain, within, problems)
 
-    return in_units(goal, states, inputs, boxed, problems)
+    def shape(value: Any, path: At, within: bool) -> Any:
+        if isinstance(value, list):
+            return [shape(v, (*path, i), within) for i, v in enumerate(value)]
+        if isinstance(value, Cut):
+            _parsed(value.where, axes.states, (*path, "where"), problems)
+            return Cut.model_construct(box=boxed(value.box, (*path, "box"), within), where=value.where)
+        if isinstance(value, Round):
+            return _round(value, path, axes, problems)
+        return boxed(value, path, within)
+
+    def targeted(value: Targeted, path: At) -> Targeted:
+        return Targeted.model_construct(
+            target=shape(value.target, (*path, "target"), True),
+            avoid=shape(value.avoid, (*path, "avoid"), False),
+            stay=None if value.stay is None else boxed(value.stay, (*path, "stay"), True),
+        )
+
+    out: dict[str, Any] = {}
+    for kind in GOALS:
+        if (value := getattr(goal, kind)) is not None and kind not in ("ltl", "automaton"):
+            out[kind] = targeted(value, (*at, kind)) if isinstance(value, Targeted) else shape(value, (*at, kind), True)
+    if goal.regions is None:
+        return GoalConfig.model_construct(None, **out)
+    if goal.ltl is not None:
+        _worded(goal.ltl, goal.regions, at, problems)
+    return GoalConfig.model_construct(
+        ltl=goal.ltl,
+        automaton=goal.automaton,
+        regions={name: shape(r, (*at, "regions", name), False) for name, r in goal.regions.items()},
+        avoid=shape(goal.avoid, (*at, "avoid"), False),
+        stay=None if goal.stay is None else boxed(goal.stay, (*at, "stay"), True),
+    )
+
+
+def _worded(text: str, regions: Mapping[str, Any], at: At, problems: list[Problem]) -> None:
+    """Is the formula one that can be kept, over the regions that there are?"""
+    try:
+        names = read_automaton("ltl", text).propositions
+    except UsageError as error:
+        problems.append(Problem((*at, "ltl"), str(error).partition("ltl: ")[2]))
+        return
+    problems += [Problem((*at, "ltl"), f"no region '{n}'", near(n, regions)) for n in names if n not in regions]
+    unused = [n for n in regions if n not in names]
+    problems += [Problem((*at, "regions", n), f"region '{n}' is not in the formula", near(n, names), "key") for n in unused]
+
+
+def read_automaton(form: str, *text: str) -> Automaton:
+    """What a text of this form says, by the component that reads it."""
+    automaton: Automaton = registry().get("automaton", form).load()(*text)
+    return automaton
+
+
+def _parsed(texts: Sequence[str], units: Units, path: At, problems: list[Problem]) -> list[Relation]:
+    """Linear inequalities; nothing can be said of a model whose axes are not known."""
+    from gapcert.contracts.data.inequality import MalformedError, parse
+
+    found: list[Relation] = []
+    for k, text in enumerate(texts if units else ()):
+        try:
+            found += parse(text, units)
+        except MalformedError as error:
+            problems.append(Problem((*path, k), str(error), error.hint, offset=error.offset))
+    return found
 
 
 def _state_box(
-    box: Mapping[str, Any],
-    path: At,
-    states: Units,
-    inputs: Units,
-    domain: Mapping[str, Any],
-    within: bool,
-    problems: list[Problem],
+    box: Mapping[str, Any], path: At, axes: Axes, domain: Mapping[str, Any], within: bool, problems: list[Problem]
 ) -> Ranges:
-    for name in box if states else ():
-        if name in inputs:
-            problems.append(
-                Problem((*path, name), f"'{name}' is an input; a goal is about states ({', '.join(states)})", where="key")
-            )
-        elif name not in states:
-            problems.append(unknown_key((*path, name), states, "state"))
-    ranges = _box(box, path, {**states, **inputs}, problems)
+    strange = [n for n in box if axes.states and (n in axes.inputs or n not in axes.states)]
+    problems += [_no_state((*path, n), axes) for n in strange]
+    ranges = _box(box, path, {**axes.states, **axes.inputs}, problems)
     outside: Callable[[float, float, float, float], bool] = (
         (lambda a, b, low, high: a < low or b > high) if within else (lambda a, b, low, high: b < low or a > high)
     )
     for name, (a, b) in ranges.items():
         if name in domain and not isinstance(domain[name][0], str) and outside(a, b, *domain[name]):
             low, high = domain[name]
-            problems.append(
-                Problem(
-                    (*path, name), f"[{a:g}, {b:g}] is outside the domain [{low:g}, {high:g}]", "shrink it, or widen domain:"
-                )
-            )
+            told = f"[{a:g}, {b:g}] is outside the domain [{low:g}, {high:g}]"
+            problems.append(Problem((*path, name), told, "shrink it, or widen domain:"))
     return ranges
+
+
+def _no_state(at: At, axes: Axes) -> Problem:
+    """About a name that is no state's."""
+    what = f"'{at[-1]}' is an input; a goal is about states ({', '.join(axes.states)})"
+    return Problem(at, what, where="key") if at[-1] in axes.inputs else unknown_key(at, axes.states, "state")
+
+
+def _round(value: Round, path: At, axes: Axes, problems: list[Problem]) -> Round:
+    made: dict[str, dict[str, Any]] = {"centre": {}, "radii": {}}
+    for part, numbers in made.items():
+        for name, given in getattr(value, part).items():
+            at = (*path, part, name)
+            if axes.states and name not in axes.states:
+                problems.append(_no_state(at, axes))
+            elif (number := _number(given, axes.states.get(name, "1"), at, problems)) is not None:
+                numbers[name] = number
+                if part == "radii" and not number > 0:
+                    problems.append(Problem(at, f"found {number:g}; expected a positive radius"))
+    if set(value.centre) != set(value.radii):
+        odd = sorted(set(value.centre) ^ set(value.radii))[0]
+        have, lack = ("centre", "radii") if odd in value.centre else ("radii", "centre")
+        problems.append(Problem((*path, have, odd), f"'{odd}' is not in {lack}", f"name the same states in {lack}", "key"))
+    return Round.model_construct(None, **made)
+
+
+def _cuts(config: Config, axes: Axes) -> list[Problem]:
+    """What is wrong with relations, coordinates and symmetries. Nothing can be said of a model whose axes are not known."""
+    units = {**axes.states, **axes.inputs}
+    if not units or not (config.relations or config.symmetries or config.coordinates):
+        return []
+    from gapcert.contracts.data.inequality import substitution
+    from gapcert.numerics.constraint_zone import Zone
+
+    problems = list[Problem]()
+    found = _parsed(config.relations, units, ("relations",), problems)
+    for name, fault in substitution(config.coordinates, *axes)[1] if config.coordinates else ():
+        place: At = ("coordinates", name) if name else ("coordinates",)
+        where: Literal["key", "value"] = "value" if fault.offset >= 0 else "key"
+        problems.append(Problem(place, str(fault), fault.hint, where, max(fault.offset, 0)))
+    ends = zip(*((config.domain or {}).get(name, ("", "")) for name in units), strict=True)
+    low, high = (tuple(end for end in side if isinstance(end, float)) for side in ends)
+    if found and not problems and len(low) == len(high) == len(units):
+        import numpy as np
+
+        try:
+            Zone(low, high, tuple(found)).draw(1, np.random.default_rng(0))
+        except UsageError as error:
+            problems.append(Problem(("relations",), str(error).partition(": ")[2]))
+    for k, name in enumerate(config.symmetries.translation if config.symmetries else ()):
+        at = ("symmetries", "translation", k)
+        if name not in units:
+            unknown = unknown_key((name,), units, "state or input")
+            problems.append(Problem(at, unknown.message, unknown.hint))
+        elif bound := next((r for r in found if r.coefficients[list(units).index(name)]), None):
+            hint = "leave it out of one of them"
+            problems.append(Problem(at, f"'{name}' stands in the relation '{bound.text}', which a shift may break", hint))
+    return problems

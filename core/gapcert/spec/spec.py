@@ -6,7 +6,7 @@ import functools
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
@@ -16,15 +16,10 @@ from gapcert.contracts.plugins.options import of_config
 from gapcert.contracts.plugins.registry import Registry, registry
 from gapcert.numerics.errors import GapcertError, UsageError
 from gapcert.spec.check import COMPONENTS, SpecChecker
-from gapcert.spec.editors.schema import schema
-from gapcert.spec.expect import evaluate_expectations
-from gapcert.spec.relations import relate
-from gapcert.spec.sections.config import Config
-from gapcert.spec.text.compose import (
+from gapcert.spec.compose import (
+    data_files,
     extend,
-    inside,
     load_tree,
-    matching,
     matrix_problems,
     override,
     parse_path,
@@ -32,15 +27,15 @@ from gapcert.spec.text.compose import (
     variant_name,
     variants,
 )
-from gapcert.spec.text.source import Mark, Problem, Source, Tree, failure, failures, parse, plain
+from gapcert.spec.relations import relate
+from gapcert.spec.sections.sections import Config
+from gapcert.spec.source import Mark, Problem, Source, Tree, failure, failures, parse, plain
 
 if TYPE_CHECKING:
     from gapcert.contracts.controllers.goal import Goal
     from gapcert.contracts.data.recording import Recording
     from gapcert.contracts.systems.domain import Domain
     from gapcert.contracts.systems.system import Model
-
-__all__ = ["Config", "Spec", "evaluate_expectations", "load_spec", "schema"]
 
 
 @final
@@ -97,7 +92,7 @@ class Spec:
         if isinstance(sampling := part.get("sampling"), Mapping):
             part["sampling"] = {k: v for k, v in sampling.items() if k not in ("executor", "workers")}
         total = hashlib.sha256(json.dumps(part, sort_keys=True).encode())
-        for path in (inner for named in self.files for inner in _inside(named)):
+        for path in (inner for named in self.files for inner in data_files(named)):
             total.update(hashlib.sha256(path.read_bytes()).digest())
         return total.hexdigest()
 
@@ -161,16 +156,6 @@ def _without(text: str, at: tuple[str, ...]) -> str:
         for end in range(len(at), k, -1):
             text = text.removeprefix(f"{'.'.join(at[k:end])}: ")
     return text
-
-
-def _inside(path: Path) -> Iterator[Path]:
-    """A file, the files of a folder (a bag, a data set; not its videos), or those that a pattern stands for."""
-    if path.is_dir():
-        yield from inside(path)
-    elif path.is_file():
-        yield path
-    elif "*" in path.name:
-        yield from matching(path)
 
 
 def load_spec(

@@ -9,6 +9,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from gapcert.contracts.plugins.registry import registry
+from gapcert.lazy import homes
 
 if TYPE_CHECKING:
     from gapcert.testing.execution import ExecutorContract as ExecutorContract
@@ -22,19 +23,16 @@ if TYPE_CHECKING:
     from gapcert.testing.systems import SystemContract as SystemContract
     from gapcert.testing.systems import ToyOscillator as ToyOscillator
 
-# One name per line: where each lives.
-_HOME = {
-    "ExecutorContract": "gapcert.testing.execution",
-    "ModelContract": "gapcert.testing.models",
-    "ObserverContract": "gapcert.testing.observers",
-    "PluginContract": "gapcert.testing.plugins",
-    "SystemContract": "gapcert.testing.systems",
-    "ToyOscillator": "gapcert.testing.systems",
-    "chirp": "gapcert.testing.signals",
-    "multisine": "gapcert.testing.signals",
-    "steps": "gapcert.testing.signals",
-    "write_csv": "gapcert.testing.signals",
-}
+_HOME = homes(
+    {
+        "gapcert.testing.execution": "ExecutorContract",
+        "gapcert.testing.models": "ModelContract",
+        "gapcert.testing.observers": "ObserverContract",
+        "gapcert.testing.plugins": "PluginContract",
+        "gapcert.testing.signals": "chirp multisine steps write_csv",
+        "gapcert.testing.systems": "SystemContract ToyOscillator",
+    }
+)
 
 __all__ = sorted(_HOME)
 

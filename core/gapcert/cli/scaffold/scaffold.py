@@ -22,7 +22,7 @@ from typing import final
 from gapcert.contracts.plugins.registry import installed
 from gapcert.numerics.errors import UsageError
 from gapcert.spec.check import COMPONENTS
-from gapcert.spec.editors.offers import SECTIONS
+from gapcert.spec.sections.sections import SECTIONS
 
 _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 _LONGEST = 30  # characters of a name; chosen, not measured

@@ -11,7 +11,8 @@ from gapcert.contracts.data.inequality import parse
 from gapcert.contracts.systems.domain import Box, Domain
 from gapcert.contracts.systems.region import Ellipsoid, Polytope, Region
 from gapcert.numerics.errors import UsageError
-from gapcert.spec.sections.areas import Cut, GoalConfig, Round, read_automaton
+from gapcert.spec.relations import read_automaton
+from gapcert.spec.sections.sections import Cut, GoalConfig, Round
 
 
 def goal(config: GoalConfig, domain: Domain, folder: Path) -> Goal:

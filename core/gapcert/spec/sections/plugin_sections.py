@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from abc import ABC
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, final
 
@@ -13,10 +13,9 @@ from pydantic import BaseModel
 from gapcert.contracts.plugins.component import load
 from gapcert.contracts.plugins.registry import Registry
 from gapcert.numerics.errors import UsageError
-from gapcert.spec.editors.offers import SECTIONS
 from gapcert.spec.models import validate
-from gapcert.spec.sections.config import Config
-from gapcert.spec.text.source import At, Problem
+from gapcert.spec.sections.sections import SECTIONS, Config
+from gapcert.spec.source import At, Problem
 
 Schema = dict[str, Any]
 
@@ -129,8 +128,3 @@ def contributed(registry: Registry) -> dict[str, SpecSection]:
             reason = f"cannot be read ({type(error).__name__}: {error})"
             found[part.name] = _Unreadable(part.name, reason, f"a fault of {part.distribution}; see `gapcert plugins`")
     return found
-
-
-def simulated(core: Iterable[str], more: Mapping[str, SpecSection]) -> tuple[str, ...]:
-    """The sections of the core and of plugins that ask a simulator."""
-    return (*core, *(name for name, section in more.items() if section.simulated))

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gapcert.contracts.plugins.options import of_config
 from gapcert.contracts.plugins.registry import Registry
-from gapcert.spec.sections.config import Config
-from gapcert.spec.sections.plugin_sections import SpecSection, simulated
-from gapcert.spec.sections.sections import CertificateConfig
-from gapcert.spec.text.source import Problem
+from gapcert.spec.sections.plugin_sections import SpecSection
+from gapcert.spec.sections.sections import CertificateConfig, Config
+from gapcert.spec.source import Problem
 
 BESIDE_DECLARED = ("sampling", "symmetries")
 BESIDE_MEASURED = ("sampling", "hidden", "symmetries", "coordinates", "controller")
@@ -48,7 +47,7 @@ def declared_problems(
     what = "needs a simulator, and γ is declared without one"
     short = [k for k in ("model", "domain") if k not in data and {"controller", "certificate"} & data.keys()]
     found += [Problem(("gap",), f"'gap' needs '{k}', which is missing", f"add {k}:", "key") for k in short]
-    asking = [k for k in simulated(BESIDE_DECLARED, more) if k in data]
+    asking = _asking(BESIDE_DECLARED, data, more)
     found += [Problem((k,), f"'{k}' {what}", "add backend:, or remove it", "key") for k in asking]
     spent = () if asked is None else sorted(asked.model_fields_set - {"claim"})
     found += [Problem(("certificate", k), f"'{k}' {what}", "add backend:, or remove it", "key") for k in spent]
@@ -73,7 +72,7 @@ def measured_problems(
         what = "only a recording in place of a backend has windows"
         return [Problem(("certificate", k), what, f"remove {k}:", "key") for k in own]
     hint = "the spec has a recording in its place"
-    found = [Problem((k,), f"'{k}' needs a simulator", hint, "key") for k in simulated(BESIDE_MEASURED, more) if k in data]
+    found = [Problem((k,), f"'{k}' needs a simulator", hint, "key") for k in _asking(BESIDE_MEASURED, data, more)]
     if config.report.beside:
         found.append(
             Problem(("report", "beside"), "certificates of a recording have none beside them", "remove beside:", "key")
@@ -88,6 +87,11 @@ def measured_problems(
         what = f"nothing for '{missing[0]}'; every state and input of the model has to be measured ({', '.join(axes)})"
         found.append(Problem(("recording", told[0]), what, f"add {missing[0]}:", "key"))
     return found + ([] if asked is None else _claim(asked))
+
+
+def _asking(own: Sequence[str], data: Mapping[str, Any], more: Mapping[str, SpecSection]) -> list[str]:
+    """Sections that are there and ask a simulator: some of the core's own, and those of plugins that say so."""
+    return [k for k in (*own, *(name for name, section in more.items() if section.simulated)) if k in data]
 
 
 def _claim(asked: CertificateConfig) -> list[Problem]:

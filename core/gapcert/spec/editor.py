@@ -8,7 +8,7 @@ import re
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, final
+from typing import Any
 
 from gapcert.numerics.errors import UsageError
 from gapcert.spec.thresholds import THRESHOLDS
@@ -21,11 +21,6 @@ _SKIPPED = {"node_modules", "runs", "build", "dist", "site-packages", "__pycache
 _SPEC = re.compile(r"^version: *1 *(?:#.*)?$", re.MULTILINE), re.compile(r"^name: *\S", re.MULTILINE)
 
 
-@final
-class _Commented(Exception):
-    """Settings that Python's JSON cannot read without losing their comments."""
-
-
 def install(folder: Path, schema: dict[str, Any]) -> dict[str, Any]:
     """Write the schema below a folder, and name it in its VS Code settings, which keep all else that they hold.
 
@@ -35,10 +30,7 @@ def install(folder: Path, schema: dict[str, Any]) -> dict[str, Any]:
     if not folder.is_dir():
         raise UsageError(f"{folder}: there is no such folder; expected the one that your editor opens")
     # What cannot be used is said before anything is written.
-    try:
-        settings, text = _settings(folder)
-    except _Commented:
-        settings, text = {}, None
+    settings, text = _settings(folder)
     key, match = f"./{SCHEMA.as_posix()}", sorted({*MATCH, *_others(folder)})
     schemas = settings.setdefault("yaml.schemas", {})
     if not isinstance(schemas, dict):
@@ -91,8 +83,8 @@ def write(path: Path, text: str) -> None:
         raise
 
 
-def _settings(folder: Path) -> tuple[dict[str, Any], str]:
-    """(what they say, their text); UsageError where they are broken, _Commented where they have comments."""
+def _settings(folder: Path) -> tuple[dict[str, Any], str | None]:
+    """(what they say, their text); no text where Python's JSON would lose their comments, UsageError where they are broken."""
     path = folder / SETTINGS
     if not path.exists():
         return {}, ""
@@ -102,7 +94,7 @@ def _settings(folder: Path) -> tuple[dict[str, Any], str]:
         found = json.loads(text) if text.strip() else {}
     except ValueError as error:
         if re.search(r"//|/\*|,\s*[}\]]", text):
-            raise _Commented from None
+            return {}, None
         raise UsageError(f"{path}: it is not JSON ({error}); mend it, and run this again") from None
     if not isinstance(found, dict):
         raise UsageError(f"{path}: found {type(found).__name__}; expected an object; mend it, and run this again")

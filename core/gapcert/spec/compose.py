@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gapcert.spec.text.source import At, Key, Mark, Problem, Source, Tree, failure, parse, read
+from gapcert.spec.source import At, Key, Mark, Problem, Source, Tree, failure, parse, read
 from gapcert.spec.thresholds import THRESHOLDS
 
 
@@ -48,17 +48,21 @@ def matching(path: Path) -> list[Path]:
     return sorted(p for p in path.parent.glob(re.sub(r"\*+", "*", path.name)) if regular(p))
 
 
-def inside(folder: Path) -> list[Path]:
-    """The files of a folder (a bag, a data set; not its videos), and never more than one over what a folder may have."""
-    found = (p for p in folder.rglob("*") if p.suffix not in (".mp4", ".png") and regular(p))
-    return sorted(itertools.islice(found, THRESHOLDS.folder_files + 1))
+def data_files(path: Path) -> list[Path]:
+    """A file, those that a pattern stands for, or those of a folder (a bag, a data set; not its videos), and of these never
+    more than one over what a folder may have.
+    """
+    if path.is_dir():
+        found = (p for p in path.rglob("*") if p.suffix not in (".mp4", ".png") and regular(p))
+        return sorted(itertools.islice(found, THRESHOLDS.folder_files + 1))
+    return [path] if path.is_file() else matching(path) if "*" in path.name else []
 
 
 def crowded(folder: Path) -> str:
     """Why a folder cannot be the data of a spec, or ""."""
     if folder.resolve().parts[1:2] in (("proc",), ("sys",), ("dev",)):
         return "belongs to the system"
-    return f"has more than {THRESHOLDS.folder_files:,} files" if len(inside(folder)) > THRESHOLDS.folder_files else ""
+    return f"has more than {THRESHOLDS.folder_files:,} files" if len(data_files(folder)) > THRESHOLDS.folder_files else ""
 
 
 def read_nothing(label: str) -> Tree:
@@ -149,16 +153,14 @@ def parse_path(text: str) -> At:
 
 def variants(tree: Tree) -> Iterator[tuple[dict[str, Any], Tree]]:
     """Each combination of a matrix as ({path: value}, tree without `matrix`); one, unnamed, where there is no matrix."""
-    matrix = tree.data.get("matrix") if isinstance(tree.data, dict) else None
-    bare = replace(tree, data={k: v for k, v in tree.data.items() if k != "matrix"}) if isinstance(tree.data, dict) else tree
-    if (
-        not isinstance(matrix, dict)
-        or not matrix
-        or not all(isinstance(v, list) and v for v in matrix.values())
-        or _many(matrix)
-    ):
+    if not isinstance(tree.data, dict):
+        yield {}, tree
+        return
+    bare = replace(tree, data={k: v for k, v in tree.data.items() if k != "matrix"})
+    if "matrix" not in tree.data or matrix_problems(tree.data):
         yield {}, bare
         return
+    matrix = tree.data["matrix"]
     for picks in itertools.product(*(range(len(v)) for v in matrix.values())):
         out, chosen = bare, {}
         for (name, values), i in zip(matrix.items(), picks, strict=True):
@@ -175,17 +177,13 @@ def matrix_problems(data: Any) -> list[Problem]:
         return []
     if not isinstance(data["matrix"], Mapping) or not data["matrix"]:
         return [Problem(("matrix",), "expected a mapping of at least one path", hint)]
-    if _many(data["matrix"]):
+    if math.prod(len(v) for v in data["matrix"].values() if isinstance(v, list)) > THRESHOLDS.matrix_specs:
         return [Problem(("matrix",), f"it stands for more than {THRESHOLDS.matrix_specs:,} specs", "split it")]
     return [
         Problem(("matrix", name), "expected a list of at least one value", hint)
         for name, values in data["matrix"].items()
         if not (isinstance(values, list) and values)
     ]
-
-
-def _many(matrix: Mapping[str, Any]) -> bool:
-    return math.prod(len(v) for v in matrix.values() if isinstance(v, list)) > THRESHOLDS.matrix_specs
 
 
 def variant_name(name: str, chosen: Mapping[str, Any]) -> str:

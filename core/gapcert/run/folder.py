@@ -1,11 +1,16 @@
-"""What makes a folder a run folder: `run.json` and `spec.json`, from which alone the run can go on."""
+"""A run folder: what makes it one, `run.json` and `spec.json`, from which alone the run can go on; and whose it is.
+
+That is the lock which a run holds, and what it writes there, by which others see it without touching the lock.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+import socket
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +21,7 @@ from gapcert.numerics.errors import UsageError
 if TYPE_CHECKING:
     from gapcert.spec.spec import Spec
 
-MARK, SPEC = "run.json", "spec.json"
+MARK, SPEC, LOCK = "run.json", "spec.json", "run.lock"
 
 
 def place(spec: Spec, out: Path) -> Path:
@@ -127,3 +132,77 @@ def _changes(files: Mapping[str, str], home: Path) -> str:
 
 def _sha256(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@contextmanager
+def owned(folder: Path) -> Iterator[None]:
+    """The folder is this process's alone; the lock goes with the process, however that ends. UsageError where it is taken."""
+    import fcntl
+
+    try:
+        # Opened without truncation: what it says is of whoever holds the lock.
+        lock = open(folder / LOCK, "a+", encoding="utf-8")  # noqa: SIM115
+    except FileNotFoundError:
+        raise UsageError(f"{folder}: was removed just now; run it again") from None
+    except OSError as error:
+        raise UsageError(f"{folder}: cannot be written ({error.strerror}); choose another folder with --out") from None
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UsageError(
+                f"{folder}: another process runs this spec; wait for it, or choose another folder with --out"
+            ) from None
+        if not _same(folder / LOCK, lock.fileno()):
+            raise UsageError(f"{folder}: was removed just now; run it again")
+        lock.truncate(0)
+        lock.write(json.dumps(myself()) + "\n")
+        lock.flush()
+        try:
+            yield
+        finally:
+            with suppress(OSError):
+                lock.truncate(0)
+
+
+def _same(path: Path, descriptor: int) -> bool:
+    try:
+        return os.path.samestat(os.stat(path), os.fstat(descriptor))
+    except FileNotFoundError:
+        return False
+
+
+def myself() -> dict[str, Any]:
+    """This process, so that no later one of the same number is taken for it."""
+    return {"pid": os.getpid(), "place": _place(), "born": _born(os.getpid())}
+
+
+def owner(folder: Path) -> dict[str, Any] | None:
+    """Who holds the lock, or held it and was killed, as the lock says; None where it says nothing that can be read."""
+    found = stored(folder, LOCK)
+    return found if found is not None and isinstance(found.get("pid"), int) else None
+
+
+def alive(holder: Mapping[str, Any]) -> bool | None:
+    """Whether that process still runs; None where it is of another machine or container, which cannot be seen."""
+    if holder.get("place") != _place():
+        return None
+    return (born := _born(holder["pid"])) is not None and born == holder.get("born")
+
+
+def _place() -> str:
+    """The machine and its process numbers: containers of one name have numbers of their own."""
+    space = ""
+    with suppress(OSError):
+        space = os.readlink("/proc/self/ns/pid")
+    return f"{socket.gethostname()} {space}".strip()
+
+
+def _born(pid: int) -> int | None:
+    """When a process began, in ticks since the machine did; None where there is none, or it has ended and is not yet buried."""
+    try:
+        # The name, in brackets, may hold anything.
+        words = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
+        return None if words[0] in "ZX" else int(words[19])
+    except (OSError, ValueError, IndexError):
+        return None

@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import final
 
 from gapcert.numerics.errors import UsageError
-from gapcert.run.lock import LOCK, owned
-from gapcert.run.manifest import MARK, is_run
+from gapcert.run.folder import LOCK, MARK, is_run, owned
 from gapcert.run.status import RunFolder, walk
 
 LEDGER = "ledger.json"

@@ -1,1 +1,0 @@
-"""Run folders: listed, compared, cleaned, watched."""

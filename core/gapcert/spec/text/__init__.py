@@ -1,1 +1,0 @@
-"""YAML with places, and specs that extend others."""
