@@ -17,7 +17,7 @@ from gapcert_recordings import JITTER, repairs
 from .data import time_units as clocks
 from .data.dataset import Dataset, Windows
 from .data.joint_limits import kept_within
-from .experiment.design import Limits, told_apart
+from .experiment import Limits, told_apart
 from .figure import figure
 from .fitting.fit import Fit, fit
 from .fitting.rollout_error import Stretches, stretches

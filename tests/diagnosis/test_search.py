@@ -10,7 +10,7 @@ from exams.hidden.draw import single
 import gapcert as gc
 from gapcert.testing import multisine
 from gapcert_diagnosis.data.dataset import Dataset
-from gapcert_diagnosis.experiment.design import Limits, told_apart
+from gapcert_diagnosis.experiment import Limits, told_apart
 from gapcert_diagnosis.search import effect_size as effort
 from gapcert_diagnosis.search import gains
 from gapcert_diagnosis.search import screening as screen
