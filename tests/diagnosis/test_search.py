@@ -11,7 +11,6 @@ import gapcert as gc
 from gapcert.testing import multisine
 from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.experiment import Limits, told_apart
-from gapcert_diagnosis.search import effect_size as effort
 from gapcert_diagnosis.search import gains
 from gapcert_diagnosis.search import screening as screen
 from gapcert_diagnosis.search.alternatives import answered, flags, smallest
@@ -19,8 +18,7 @@ from gapcert_diagnosis.search.candidates import Library
 from gapcert_diagnosis.search.criterion import better, keys, richer, values
 from gapcert_diagnosis.search.fitted_sets import FittedSets
 from gapcert_diagnosis.search.moves import spared, swaps
-from gapcert_diagnosis.search.stepwise import EquationSearch
-from gapcert_diagnosis.search.validation import drop_unconfirmed, search_windows
+from gapcert_diagnosis.search.stepwise import EquationSearch, drop_unconfirmed, search_windows
 from gapcert_diagnosis.testing import ROD, equations
 
 T, PERIOD = 1400, 0.01
@@ -179,7 +177,7 @@ def test_a_cause_below_one_per_cent_of_the_effort_is_listed_and_not_named():
     assert found[0] == ()
     (key, share) = next((k, s) for k, s in search.negligible.items() if k[0] == "viscous-friction")
     assert key == ("viscous-friction", "q")
-    assert 0.001 < share < effort.THRESHOLDS.least_effort
+    assert 0.001 < share < screen.THRESHOLDS.least_effort
 
 
 @pytest.mark.exam

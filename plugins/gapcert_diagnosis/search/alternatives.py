@@ -18,7 +18,7 @@ from .candidates import Candidate, Causes, Library
 from .criterion import Found, fails, keys, rank, richer, values, without
 from .fitted_sets import FittedSets
 from .moves import additions, spared
-from .validation import judge
+from .stepwise import judge
 
 
 @final

@@ -17,7 +17,7 @@ squared residual of a channel over that of noise, G the charge for one more caus
 | `setting_pays` | a fit under another setting      | χ falls by `setting_share`, ΔS > charge               | settings       |
 
 Where a search is cautious and the closer of two fits is rough, ΔS is at most z², `rough_charge` stands for G, and
-`sure_errors`² or `spared_score` for `richer_score`. `effect_size` says which causes are too small to be named, and
+`sure_errors`² or `spared_score` for `richer_score`. `FittedSets.small` says which causes are too small to be named, and
 `native.stepwise` what pays for an engine.
 """
 

@@ -20,7 +20,7 @@ from .candidates import Causes, Library, once
 from .criterion import Found, better, noise, numbers, setting_pays, values, without
 from .fitted_sets import FittedSets
 from .moves import additions
-from .validation import confirms, search_windows
+from .stepwise import confirms, search_windows
 
 Tried = tuple[Variant, Causes, Fit]
 Numbers = dict[str, float]
@@ -48,7 +48,7 @@ class Settled:
 
 
 def across(library: Library, effects: Sequence[Effect], windows: Windows, tell: Callable[..., None]) -> Settled:
-    """The search of `validation.search_windows`, and again under settings with which the score is better.
+    """The search of `stepwise.search_windows`, and again under settings with which the score is better.
 
     A setting has no number, but was chosen among as many as there are: it pays as a cause does, unless it takes the place of
     causes, which pay for their numbers already.

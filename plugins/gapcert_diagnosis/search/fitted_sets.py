@@ -14,7 +14,6 @@ from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Candidate, Causes, Library, once
 from .criterion import Found, Keys, better, decides, keys, named, noise, numbers, pays, rough_charge, values
-from .effect_size import negligible
 from .gains import Promise
 from .screening import Screen, standing_in
 
@@ -187,7 +186,10 @@ class FittedSets:
 
     def small(self, found: Found) -> dict[tuple[str, str], float]:
         """(effect, site) → share of the effort of causes that are too small to be named."""
-        return {(effect, site): share for effect, site, share in negligible(self.screen, found[0], values(found[1]))}
+        known = values(found[1])
+        shares = {c.key: self.screen.share(c, known) for c in found[0]}
+        least = {c.key: THRESHOLDS.least_output if c.effect.site == "output" else THRESHOLDS.least_effort for c in found[0]}
+        return {key: share for key, share in shares.items() if share < least[key]}
 
     def matters(self, found: Found) -> bool:
         """Is every cause larger than what an integrator may leave, or than a stated tolerance? What is not, is noted.
