@@ -14,9 +14,8 @@ from gapcert.plugin import Effect, Emit, Event, Model, Recording, UsageError, re
 from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_recordings import JITTER, repairs
 
-from .data import time_units as clocks
+from .data.consistency import agreeing, doubt, kept_within, ordered
 from .data.dataset import Dataset, Windows
-from .data.joint_limits import kept_within
 from .experiment import Limits, told_apart
 from .figure import figure
 from .fitting.fit import Fit, fit
@@ -89,8 +88,8 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
     design = told_apart(answer.causes, answer.fit, answer.ties, dataset, limits, seed)[0]
     lap("experiment")
     left = leftover.left(data.library.extended(answer.causes, values(answer.fit)), answer.fit, answer.windows, seed)
-    doubt = clocks.doubt(answer.fit, answer.windows)
-    verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, design is not None, bool(doubt))
+    doubted = doubt(answer.fit, answer.windows)
+    verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, design is not None, bool(doubted))
     lap("leftover")
     ties = [tuple(c.key for c in tie) for tie, _ in answer.ties]
     ties += [(("engine-setting", s.runner_up.setting),) for s in settings if s.runner_up and s.margin < THRESHOLDS.tie_score]
@@ -111,7 +110,7 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
         negligible=tuple((*k, s) for k, s in answer.negligible.items() if k not in keys(answer.causes)),
         smallest=smallest(answer.search) if verdict == "nothing" else (),
         log={**dataset.log, "hold": dataset.hold or "undeclared"},
-        assumptions=(*data.assumptions, *doubt),
+        assumptions=(*data.assumptions, *doubted),
         # How long the experiments were, of which none tells the ties apart.
         seconds=limits.seconds if answer.ties and limits.inputs and not design else None,
         warnings=coarse(answer.fit, answer.windows),
@@ -195,7 +194,7 @@ def _effects(effects: Sequence[Effect | str] | Literal["all"]) -> list[Effect]:
 
 def _timed(model: Model, recording: Recording, horizons: Sequence[float]) -> None:
     """Refuses rows in no order, and what is shorter than a sample: as a rule times in another unit than they are read in."""
-    clocks.ordered(recording)
+    ordered(recording)
     period, shortest = recording.period, min(horizons, default=math.inf)
     if 0 < shortest < (1 - JITTER) * period:
         raise UsageError(
@@ -203,7 +202,7 @@ def _timed(model: Model, recording: Recording, horizons: Sequence[float]) -> Non
             "that; is its time in s? Give the unit of that column otherwise, recording.units: {TIME: ms}, or longer horizons",
             ("diagnose", "horizons"),
         )
-    clocks.agreeing(model, recording)
+    agreeing(model, recording)
 
 
 def _length(measured: Dataset, model: Model, window: float | None) -> int:

@@ -10,8 +10,8 @@ from gapcert.plugin import Extension, Memory
 from gapcert.testing import multisine
 from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.fitting import fit as fitting
-from gapcert_diagnosis.fitting.fit import Hypothesis, carried, fit, followed, stepped
-from gapcert_diagnosis.fitting.hypothesis import between
+from gapcert_diagnosis.fitting.fit import carried, fit, followed, stepped
+from gapcert_diagnosis.fitting.hypothesis import Hypothesis, between
 from gapcert_diagnosis.testing import ROD, equations
 from gapcert_diagnosis.thresholds import THRESHOLDS
 

@@ -11,8 +11,7 @@ import gapcert as gc
 from gapcert.contracts.systems.extension import Extension, Memory, Parameter
 from gapcert.testing import multisine
 from gapcert_diagnosis.data.dataset import Dataset
-from gapcert_diagnosis.fitting.fit import fit
-from gapcert_diagnosis.fitting.restarts import rescued
+from gapcert_diagnosis.fitting.fit import fit, rescued
 from gapcert_diagnosis.residual import lack_of_fit as lackoffit
 from gapcert_diagnosis.residual import unexplained as leftover
 from gapcert_diagnosis.residual import whiteness

@@ -18,8 +18,7 @@ from gapcert_diagnosis.data.dataset import Windows
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .gauss_newton import Slopes, fall, reduced, squares, steps
-from .hypothesis import Hypothesis as Hypothesis
-from .hypothesis import nudges
+from .hypothesis import Hypothesis, nudges
 
 TRIALS = np.array([0.1, 1.0, 10.0, 100.0])
 
@@ -30,7 +29,7 @@ class Fit:
     """The best numbers theta (p,) and starts (W, nx) of a hypothesis; residual (W, L, ny) in units of the noise floor.
 
     covariance (p, p): of theta with the starts profiled out, per unit of residual variance. weight (W, L, ny): of the
-    samples, None for all alike; the residual is multiplied by it. place (W, 2): piece and first sample of the windows.
+    samples, by which the residual is multiplied. place (W, 2): piece and first sample of the windows.
     """
 
     hypothesis: Hypothesis
@@ -39,14 +38,13 @@ class Fit:
     residual: Array
     prior: float
     covariance: Array
-    weight: Array | None = None
-    place: Array | None = None
+    weight: Array
+    place: Array
 
     @cached_property
     def counts(self) -> Array:
         """Samples (ny,) that took part."""
-        w, length, ny = self.residual.shape
-        return np.full(ny, float(w * length)) if self.weight is None else np.sum(self.weight**2, axis=(0, 1))
+        return np.asarray(np.sum(self.weight**2, axis=(0, 1)))
 
     @cached_property
     def chi(self) -> Array:
@@ -56,20 +54,17 @@ class Fit:
     @cached_property
     def whiteness(self) -> Array:
         """κ (ny,) = (1 − ρ₁)/(1 + ρ₁): the share of samples that count as independent, from the lag-1 autocorrelation."""
-        r, w = self.residual, self.weight
-        rho = lag_one(r)
-        if w is not None:
-            # Of as many neighbours as there would be without gaps.
-            whole = self.counts * (w.shape[1] - 1) / w.shape[1]
-            rho = rho * whole / np.maximum(np.sum((w[:, 1:] * w[:, :-1]) ** 2, axis=(0, 1)), 1)
+        w = self.weight
+        # Of as many neighbours as there would be without gaps.
+        whole = self.counts * (w.shape[1] - 1) / w.shape[1]
+        rho = lag_one(self.residual) * whole / np.maximum(np.sum((w[:, 1:] * w[:, :-1]) ** 2, axis=(0, 1)), 1)
         return np.asarray(np.clip((1 - rho) / (1 + rho), 0.02, 1.0))
 
     @cached_property
     def each(self) -> Array:
         """χ (W, ny) of every window; less than the noise floor counts as the floor."""
-        w, length, ny = self.residual.shape
-        counts = np.full((w, ny), float(length)) if self.weight is None else np.sum(self.weight**2, axis=1)
-        return np.asarray(np.maximum(np.sum(self.residual**2, axis=1) / np.maximum(counts, 1), THRESHOLDS.counted_floor))
+        chi = np.sum(self.residual**2, axis=1) / np.maximum(np.sum(self.weight**2, axis=1), 1)
+        return np.asarray(np.maximum(chi, THRESHOLDS.counted_floor))
 
     @cached_property
     def typical(self) -> Array:
@@ -141,6 +136,27 @@ def fit(
     return Fit(h, here.theta, here.start, here.residual, float(h.prior(here.theta)), covariance, windows.weight, windows.place)
 
 
+def rescued(fitted: Fit, windows: Windows) -> Fit:
+    """The fit again from better starts of the windows that stand out, where that makes it better; else as it was.
+
+    A start velocity that is off by the noise of a difference can lead a long window over an unstable equilibrium or around
+    another turn; over a short one it cannot.
+    """
+    energy = np.mean(fitted.residual**2, axis=(1, 2))
+    lost = np.flatnonzero(energy > THRESHOLDS.lost_window * max(1.0, float(np.median(energy))))
+    if not len(lost):
+        return fitted
+    some, fixed = windows.take(lost), fitted.hypothesis.holding(fitted.theta)
+    start = some.start
+    for part in THRESHOLDS.restart_parts:
+        head = some.head(max(THRESHOLDS.window_samples, windows.length // part))
+        start = fit(fixed, head, start=start).start
+    starts = fitted.start.copy()
+    starts[lost] = start
+    again = fit(fitted.hypothesis, windows, theta=fitted.theta, start=starts)
+    return again if np.sum(again.residual**2) + again.prior < np.sum(fitted.residual**2) + fitted.prior else fitted
+
+
 def followed(h: Hypothesis, theta: Array, windows: Windows, start: Array | None = None) -> Fit:
     """Other windows with the numbers of a fit held; the residual is `blown_residual` noise floors where the simulation blows up
     there.
@@ -163,7 +179,7 @@ def carried(h: Hypothesis, theta: Array, other: Fit, windows: Windows, start: Ar
 
     start: of a fit of these windows.
     """
-    known = {} if other.place is None else dict(zip(map(tuple, other.place.tolist()), other.start, strict=True))
+    known = dict(zip(map(tuple, other.place.tolist()), other.start, strict=True))
     rows = [known.get(tuple(place)) for place in windows.place.tolist()]
     new = np.array([row is None for row in rows])
     out = np.stack([own if row is None else row for row, own in zip(rows, start, strict=True)])

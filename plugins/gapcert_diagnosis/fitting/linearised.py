@@ -20,8 +20,7 @@ from gapcert_diagnosis.search.candidates import probe, velocity
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .fit import Fit
-from .hypothesis import nudges
-from .memory_states import recalled
+from .hypothesis import nudges, recalled
 
 
 @final

@@ -10,9 +10,8 @@ import numpy as np
 
 from gapcert.plugin import Array, Model
 from gapcert_diagnosis.data.dataset import Windows
-from gapcert_diagnosis.fitting.fit import Fit, fit
+from gapcert_diagnosis.fitting.fit import Fit, fit, rescued
 from gapcert_diagnosis.fitting.linearised import Tangent
-from gapcert_diagnosis.fitting.restarts import rescued
 from gapcert_diagnosis.results import Push, Unexplained, Verdict
 from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_figures import KINDS

@@ -23,7 +23,7 @@ from gapcert.plugin import (
     site_units,
 )
 from gapcert_diagnosis.data.dataset import Dataset
-from gapcert_diagnosis.fitting.fit import Hypothesis
+from gapcert_diagnosis.fitting.hypothesis import Hypothesis
 from gapcert_diagnosis.fitting.step_size import built
 from gapcert_diagnosis.results import ORDER
 from gapcert_diagnosis.thresholds import THRESHOLDS

@@ -30,7 +30,8 @@ from typing import TypeVar
 import numpy as np
 
 from gapcert.plugin import Array
-from gapcert_diagnosis.fitting.fit import Fit, Hypothesis
+from gapcert_diagnosis.fitting.fit import Fit
+from gapcert_diagnosis.fitting.hypothesis import Hypothesis
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Causes, Library

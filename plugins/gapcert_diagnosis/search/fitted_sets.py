@@ -8,8 +8,7 @@ from functools import cached_property
 from typing import final
 
 from gapcert_diagnosis.data.dataset import Windows
-from gapcert_diagnosis.fitting.fit import Fit, carried, fit
-from gapcert_diagnosis.fitting.restarts import rescued
+from gapcert_diagnosis.fitting.fit import Fit, carried, fit, rescued
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Candidate, Causes, Library, once
