@@ -26,8 +26,8 @@ from .residual import unexplained as leftover
 from .residual.tests import evidence
 from .results import Cause, Diagnosis, Estimate, Misfit, Rival
 from .search.alternatives import Answer, answered, flags, smallest
-from .search.candidates import Candidate, Causes, Library
-from .search.criterion import keys, values
+from .search.candidates import Candidate, Library
+from .search.criterion import keys, without
 from .search.engine_settings import Setting, across
 
 
@@ -87,7 +87,7 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
     limits = Limits.of(data.library.model, dataset, asked.get("limits"), asked.get("seconds", 12.0))
     design = told_apart(answer.causes, answer.fit, answer.ties, dataset, limits, seed)[0]
     lap("experiment")
-    left = leftover.left(data.library.extended(answer.causes, values(answer.fit)), answer.fit, answer.windows, seed)
+    left = leftover.left(data.library.extended(answer.causes, answer.fit.values), answer.fit, answer.windows, seed)
     doubted = doubt(answer.fit, answer.windows)
     verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, design is not None, bool(doubted))
     lap("leftover")
@@ -195,7 +195,9 @@ def _effects(effects: Sequence[Effect | str] | Literal["all"]) -> list[Effect]:
 def _timed(model: Model, recording: Recording, horizons: Sequence[float]) -> None:
     """Refuses rows in no order, and what is shorter than a sample: as a rule times in another unit than they are read in."""
     ordered(recording)
-    period, shortest = recording.period, min(horizons, default=math.inf)
+    if not horizons:
+        raise UsageError("diagnose: no horizon is given; name at least one in seconds, such as [0.5]")
+    period, shortest = recording.period, min(horizons)
     if 0 < shortest < (1 - JITTER) * period:
         raise UsageError(
             f"diagnose.horizons: {shortest:g} s is shorter than {period:.6g} s, the period of the recording; expected at least "
@@ -239,8 +241,7 @@ def _named(answer: Answer, c: Candidate, judge: Stretches) -> Cause:
 def _set(answer: Answer, s: Setting, judge: Stretches) -> Cause:
     """A setting of the engine: what it explains beside all other causes, refitted without it."""
     h = Library(s.before.model, s.before.measured, []).hypothesis(answer.causes)
-    known = dict(zip(h.names, h.value.tolist(), strict=True)) | values(answer.fit)
-    before = judge.error(fit(h, answer.windows, theta=np.array([known[n] for n in h.names])))
+    before = judge.error(fit(h, answer.windows, theta=h.theta(answer.fit.values)))
     v, numbers = s.variant, dict[str, Estimate]()
     if isinstance(v.value, int | float) and not isinstance(v.value, bool):
         numbers["value"] = Estimate.of(float(v.value))
@@ -268,7 +269,7 @@ def _read(answer: Answer, c: Candidate, numbers: Mapping[str, float], judge: Str
 
 
 def _extended(answer: Answer) -> Model:
-    library, numbers = answer.library, values(answer.fit)
+    library, numbers = answer.library, answer.fit.values
     for _, found in library.seen:
         numbers |= found
     return library.extended((*answer.causes, *(c for c, _ in library.seen)), numbers)
@@ -294,12 +295,8 @@ def _misfits(answer: Answer) -> dict[str, Misfit]:
 def _experiment(answer: Answer) -> str | None:
     """What would tell the first tie apart."""
     for tie, _ in answer.ties:
-        a, b = _without(answer.causes, tie)[0], _without(tie, answer.causes)[0]
+        a, b = without(answer.causes, tie)[0], without(tie, answer.causes)[0]
         known = a.effect.rivals.get(b.effect.name) or b.effect.rivals.get(a.effect.name)
         text = known or f"{a.effect.experiment}; {b.effect.experiment}"
         return f"to tell {a.effect.name} at {a.site} from {b.effect.name} at {b.site}: {text}"
     return None
-
-
-def _without(causes: Causes, others: Causes) -> Causes:
-    return tuple(c for c in causes if c.key not in {k.key for k in others})

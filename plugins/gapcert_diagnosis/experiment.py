@@ -217,7 +217,7 @@ def _within(
 def _played(fitted: Fit, u: Array, measured: Dataset) -> Array:
     """Measured channels (n, T, ny) of the fitted model under u (n, T, nu), from where the first recording started."""
     h, n, repeat = fitted.hypothesis, len(u), measured.repeat
-    values = {**h.fixed, **dict(zip(h.names, map(float, fitted.theta), strict=True))}
+    values = {**h.fixed, **fitted.values}
     fine = np.repeat(u, repeat, axis=1)
     x0 = np.tile(measured.states[0][0], (n, 1))
     with np.errstate(all="ignore"):

@@ -72,6 +72,11 @@ class Fit:
         return np.asarray(np.exp(np.mean(np.log(self.each), axis=0)))
 
     @property
+    def values(self) -> dict[str, float]:
+        """Name → fitted number."""
+        return dict(zip(self.hypothesis.names, self.theta.tolist(), strict=True))
+
+    @property
     def rough(self) -> bool:
         """Is something left that is no noise? Then the worst windows say least about the rest."""
         return bool(self.chi.max() > THRESHOLDS.rough)

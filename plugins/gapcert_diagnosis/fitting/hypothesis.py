@@ -39,6 +39,10 @@ class Hypothesis:
         """Free numbers that the nominal model does not have."""
         return int(np.isinf(self.sd).sum())
 
+    def theta(self, known: Mapping[str, float]) -> Array:
+        """Numbers (p,): those that are known, and the others as they are stated."""
+        return np.array([known.get(n, v) for n, v in zip(self.names, self.value.tolist(), strict=True)])
+
     def prior(self, theta: Array) -> Array:
         """Σ ((θ − θ₀)/sd)² of theta (…, p)."""
         return np.asarray(np.sum(((theta - self.value) / self.sd) ** 2, axis=-1))

@@ -16,7 +16,7 @@ import numpy as np
 
 from gapcert.plugin import Array, Model, difference
 from gapcert_diagnosis.data.dataset import Windows, flat
-from gapcert_diagnosis.search.candidates import probe, velocity
+from gapcert_diagnosis.search.candidates import once, probe, velocity
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .fit import Fit
@@ -281,9 +281,7 @@ class Tangent:
 
     def once(self, key: object, make: Callable[[], Array]) -> Array:
         """What depends on the path alone, made when it is first asked for."""
-        if key not in self._made:
-            self._made[key] = make()
-        return self._made[key]
+        return once(self._made, key, make)
 
     def driven(self, B: Array, force: Array) -> Array:
         """The same for whatever moves the next state by B (W, S, nx) per unit."""

@@ -96,8 +96,6 @@ def stretches(
     A short lead leaves the start to noise, a long one to what the model lacks: where data that were fitted are given, the lead
     is the one with the least error there.
     """
-    if not horizons:
-        raise UsageError("diagnose: no horizon is given; name at least one in seconds, such as [0.5]")
     return tuple(Stretches.of(held, h, _lead(seen, h, fitted)) for h in sorted(horizons))
 
 

@@ -15,7 +15,7 @@ from gapcert_diagnosis.results import Seen
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Candidate, Causes, Library
-from .criterion import Found, fails, keys, rank, richer, values, without
+from .criterion import Found, fails, keys, rank, richer, without
 from .fitted_sets import FittedSets
 from .moves import additions, spared
 from .stepwise import judge
@@ -162,7 +162,7 @@ def _implausible(library: Library, c: Candidate, fitted: Fit) -> dict[str, tuple
     stated = None if (freed := library.freed(c)) is None else freed.value
     if stated == 0:
         return {}
-    known, scales = values(fitted), library.scales(c)
+    known, scales = fitted.values, library.scales(c)
     limits = {n: (p.plausible[0] * p.scale(scales), p.plausible[1] * p.scale(scales)) for p, n in _numbers(library, c)}
     if stated is not None and stated < 0:
         limits = {n: (-high, -low) for n, (low, high) in limits.items()}
@@ -175,7 +175,7 @@ def _numbers(library: Library, c: Candidate) -> list[tuple[EffectParameter, str]
 
 def flags(library: Library, c: Candidate, fitted: Fit) -> tuple[str, ...]:
     """Sentences about numbers that are not plausible, or that lie at the edge of what was tried."""
-    known, out = values(fitted), []
+    known, out = fitted.values, []
     low, high = library.bounds(c)
     implausible = _implausible(library, c, fitted)
     for i, ((p, name), off) in enumerate(zip(_numbers(library, c), library.off(c), strict=True)):

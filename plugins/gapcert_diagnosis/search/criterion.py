@@ -24,14 +24,13 @@ Where a search is cautious and the closer of two fits is rough, ΔS is at most z
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
 
 from gapcert.plugin import Array
 from gapcert_diagnosis.fitting.fit import Fit
-from gapcert_diagnosis.fitting.hypothesis import Hypothesis
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Causes, Library
@@ -193,16 +192,6 @@ def rough_charge(library: Library, causes: Causes, before: Causes) -> float:
     if {richer.get(n, simpler.get(n, n)) for n in names} != known:
         return math.inf
     return THRESHOLDS.number_score + (THRESHOLDS.sure_errors**2 if richer else 0.0)
-
-
-def values(fitted: Fit) -> dict[str, float]:
-    """Fitted numbers by name."""
-    return dict(zip(fitted.hypothesis.names, map(float, fitted.theta), strict=True))
-
-
-def numbers(h: Hypothesis, known: Mapping[str, float]) -> Array:
-    """Numbers (p,) of a hypothesis: those that are known, and the others as they are stated."""
-    return np.array([known.get(n, v) for n, v in zip(h.names, h.value.tolist(), strict=True)])
 
 
 def keys(causes: Causes) -> Keys:

@@ -17,7 +17,7 @@ from gapcert_diagnosis.fitting.fit import Fit, fit, stepped
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Causes, Library, once
-from .criterion import Found, better, noise, numbers, setting_pays, values, without
+from .criterion import Found, better, noise, setting_pays, without
 from .fitted_sets import FittedSets
 from .moves import additions
 from .stepwise import confirms, search_windows
@@ -99,7 +99,7 @@ class _Settings:
             # Beside a setting a simpler law may do: two numbers that are one, say.
             likely = [f for e in exact for f in _simpler(sets, e)]
         for causes, now in likely if all(f.chi.max() >= THRESHOLDS.quiet for _, f in likely) else ():
-            tried = self.rank(variants, causes, values(now))
+            tried = self.rank(variants, causes, now.values)
             if (setting := self.whole(tried, now)) is not None:
                 return Settled(*self.under(setting.variant), (setting,))
         return None
@@ -109,7 +109,7 @@ class _Settings:
         for variant, causes, first in tried[:1]:
             if not self.library.measured.exact and first.chi.max() > THRESHOLDS.plain_residual:
                 return None
-            found = self.fitted(variant.model, causes, self.earlier, values(first))
+            found = self.fitted(variant.model, causes, self.earlier, first.values)
             if found.chi.max() < THRESHOLDS.quiet and self.pays(found, before, self.library.charge(len(tried)), fewer=False):
                 return _setting(self.library, tried, variant)
         return None
@@ -124,7 +124,7 @@ class _Settings:
         Without noise any may decide. Else one counts that the windows feel, or that does nothing before a cause is there; in
         the place of a cause, about as much as they feel the cause.
         """
-        (causes, now), exact, start = found, self.library.measured.exact, values(found[1])
+        (causes, now), exact, start = found, self.library.measured.exact, found[1].values
         felt, size = [(v, 0.0) for v, _, _ in alone], 0.0
         if not exact:
             near = self.near([v for v, _ in felt], (), {})
@@ -195,7 +195,7 @@ class _Settings:
     def fitted(self, model: Model, causes: Causes, windows: Windows, start: Numbers) -> Fit:
         key = id(model), id(windows), tuple(c.key for c in causes), tuple(sorted(start.items()))
         h = self.bare(model).hypothesis(causes)
-        return once(self._fits, key, lambda: fit(h, windows, theta=numbers(h, start), iterations=THRESHOLDS.second_fit))
+        return once(self._fits, key, lambda: fit(h, windows, theta=h.theta(start), iterations=THRESHOLDS.second_fit))
 
     def pays(self, new: Fit, old: Fit, charge: float, *, fewer: bool) -> bool:
         """In place of causes only the choice is charged; beside them it pays for itself, on the later windows as well."""
@@ -207,7 +207,7 @@ class _Settings:
         best: Settled | None = None
         for tried in self.groups(alone, settled.found):
             for variant, some, first in tried[: THRESHOLDS.setting_finalists]:
-                whole = self.fitted(variant.model, some, self.earlier, values(first))
+                whole = self.fitted(variant.model, some, self.earlier, first.values)
                 if not self.pays(whole, now, charge, fewer=len(some) < len(causes)):
                     continue
                 search, again = self.under(variant)

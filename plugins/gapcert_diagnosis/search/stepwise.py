@@ -16,7 +16,7 @@ from gapcert_diagnosis.fitting.fit import Fit, fit, followed
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Candidate, Causes, Library
-from .criterion import Found, Keys, agrees, beats, better, fails, keys, margin, noise, outdoes, rank, values, without
+from .criterion import Found, Keys, agrees, beats, better, fails, keys, margin, noise, outdoes, rank, without
 from .fitted_sets import FittedSets, untold
 from .moves import additions, idle, merges, spared, swaps
 from .selection import drop, forward
@@ -113,7 +113,7 @@ class EquationSearch:
         rest = without(found[0], (cause,))
         grown, fitted = len(rest) > 1 and self.sets.known(rest) is not None, self.sets.fit(rest, found)
         # What was grown step by step may sit in a valley that only the larger set leads out of.
-        return rest, self.sets.fit_again(rest, None, values(found[1])) if grown else fitted
+        return rest, self.sets.fit_again(rest, None, found[1].values) if grown else fitted
 
     def pays(self, found: Found, rest: Found) -> bool:
         return self.sets.pays(found, rest)
@@ -127,7 +127,7 @@ class EquationSearch:
             piles = table.pursue(THRESHOLDS.most_moves)
             if piles and piles[0].gain < THRESHOLDS.alone_promise * piles[-1].gain:
                 grown = piles[-1].move
-                new = self.refine((grown, sets.fit(grown, base, values(sets.try_move(base, piles[-1])))))
+                new = self.refine((grown, sets.fit(grown, base, sets.try_move(base, piles[-1]).values)))
                 if noise(new[1], THRESHOLDS.sure_errors) and sets.pays(new, base) and sets.matters(new):
                     self.piled = keys(new[0])
                     return new
@@ -152,7 +152,7 @@ class EquationSearch:
         best = found
         for causes, first in tried[: THRESHOLDS.paired_full_fits]:
             if beats(first, now, sets.cautious, fewer=len(causes) < len(best[0])):
-                new = self.refine((causes, sets.fit(causes, nothing, values(sets.fit_further(first)))))
+                new = self.refine((causes, sets.fit(causes, nothing, sets.fit_further(first).values)))
                 more = beats(new[1], best[1], sets.cautious, fewer=len(new[0]) < len(best[0]))
                 enough = sets.better(new[1], sets.nothing) > len(new[0]) * sets.library.threshold
                 if more and enough and sets.pays(new, nothing) and sets.matters(new):
@@ -170,7 +170,7 @@ class EquationSearch:
         rest = tuple(c for c in found[0] if c.key not in small)
         if not small or keys(rest) <= keys(parent[0]):
             return found
-        return rest, self.sets.fit(rest, parent, values(found[1]))
+        return rest, self.sets.fit(rest, parent, found[1].values)
 
     def refine(self, found: Found) -> Found:
         """Drops, swaps for simpler and richer laws and merges, until none of them pays."""
@@ -233,13 +233,13 @@ def lightest(library: Library, causes: Causes, fitted: Fit) -> tuple[Causes, Arr
 def _events(sets: FittedSets, found: Found, windows: Windows, known: float) -> Found:
     """With what only the later windows show: a push that came then, or a level that was not reached before."""
     whole = FittedSets(sets.library, windows, sets.progress)
-    base = found[0], whole.fit(found[0], None, values(found[1]))
+    base = found[0], whole.fit(found[0], None, found[1].values)
     before = np.maximum(judge(base[1], sets.windows).chi, 1.0)
     for causes, fitted in additions(whole, base):
-        silent = all(whole.screen.silent(c, values(fitted), known) for c in without(causes, base[0]))
+        silent = all(whole.screen.silent(c, fitted.values, known) for c in without(causes, base[0]))
         calm = silent or (judge(fitted, sets.windows).chi < THRESHOLDS.calm_residual * before).all()
         if calm and whole.pays((causes, fitted), base) and whole.matters((causes, fitted)):
-            return causes, sets.fit(causes, found, values(fitted))
+            return causes, sets.fit(causes, found, fitted.values)
     return found
 
 
