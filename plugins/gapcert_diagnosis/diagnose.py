@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import time
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,7 +12,7 @@ from typing import Any, Literal, final
 
 import numpy as np
 
-from gapcert.plugin import Effect, Emit, Event, Model, Recording, UsageError, registry, silent
+from gapcert.plugin import BEAT, Effect, Emit, Event, Model, Recording, UsageError, registry, silent
 from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_recordings import JITTER, repairs
 
@@ -21,9 +23,7 @@ from .figure import figure
 from .fitting.fit import Fit, fit
 from .fitting.rollout_error import Stretches, stretches
 from .fitting.step_size import coarse
-from .problem import Clock, DiagnosisProblem
 from .residual import unexplained as leftover
-from .residual.tests import evidence
 from .results import Cause, Diagnosis, Estimate, Misfit, Rival
 from .search.alternatives import Answer, answered, flags, smallest
 from .search.candidates import Candidate, Library
@@ -61,6 +61,64 @@ def diagnose(
     others = (c.load()() for c in registry().of("diagnoser") if c.missing() is None)
     answer = next((d.diagnose for d in others if d.accepts(model)), _searched)
     return replace(answer(problem), timings=clock.laps)
+
+
+@final
+@dataclass(frozen=True)
+class DiagnosisProblem:
+    """Why does a model differ from a recording? The arguments of `diagnose`, with defaults made and effects built.
+
+    fitted, held_out: the parts of the recording. clock: times the parts of the work, and tells its progress.
+    """
+
+    model: Model
+    recording: Recording
+    fitted: Recording
+    held_out: Recording
+    effects: Sequence[Effect]
+    horizons: Sequence[float]
+    window: float | None
+    experiment: Mapping[str, Any]
+    seed: int
+    folder: Path | None
+    clock: Clock
+
+
+class Diagnoser(ABC):
+    """A component of kind `diagnoser`: another way to a diagnosis, for models that no search with equations suits."""
+
+    @abstractmethod
+    def accepts(self, model: Model) -> bool:
+        """Is it for this model? The first that accepts one, by name, answers; the search with equations where none does."""
+
+    @abstractmethod
+    def diagnose(self, problem: DiagnosisProblem) -> Diagnosis:
+        """The answer, without its timings: these are the laps of the problem's clock."""
+
+
+@final
+class Clock:
+    """Wall time per part in s, and progress for observers."""
+
+    def __init__(self, emit: Emit) -> None:
+        self.emit, self.count, self.last, self.told = emit, 0, time.perf_counter(), 0.0
+        self.laps: dict[str, float] = {}
+        self.best: Mapping[str, Any] = {}
+
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self.laps[name], self.last = round(now - self.last, 3), now
+
+    def tell(self, text: str, best: Mapping[str, Any] | None = None, *, fitted: bool = True) -> None:
+        """What is tried next: a hypothesis that is fitted, or one of many that are only screened, of which few are told."""
+        now = time.perf_counter()
+        self.count += fitted
+        if fitted or now - self.told > BEAT:
+            self.told = now
+            # A search that begins anew, on other windows, has no best of its own yet.
+            self.best = best or self.best
+            more = {"best": self.best} if self.best else {}
+            self.emit(Event("progress", "diagnosis", {"done": self.count, "unit": "hypotheses", "text": text, **more}))
 
 
 def _searched(problem: DiagnosisProblem) -> Diagnosis:
@@ -106,7 +164,7 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
         rest,
         figure(answer.search, answer.causes, answer.fit, judge, design, rest.correction if rest else None, plain),
         design=design,
-        evidence=evidence(left),
+        evidence=leftover.evidence(left),
         negligible=tuple((*k, s) for k, s in answer.negligible.items() if k not in keys(answer.causes)),
         smallest=smallest(answer.search) if verdict == "nothing" else (),
         log={**dataset.log, "hold": dataset.hold or "undeclared"},
@@ -167,12 +225,12 @@ def _warned(emit: Emit, fitted: Dataset, held: Dataset) -> None:
 
 def _largest_first(answer: Answer, judge: Stretches) -> Answer:
     """Causes by the held-out error that each of them missing would leave: the order of finding is the search's own affair."""
+    return replace(answer, causes=tuple(sorted(answer.causes, key=lambda c: _missing(answer, c, judge), reverse=True)))
 
-    def left(c: Candidate) -> float:
-        rest = tuple(k for k in answer.causes if k is not c)
-        return judge.error(answer.search.fit(rest, (answer.causes, answer.fit)))
 
-    return replace(answer, causes=tuple(sorted(answer.causes, key=left, reverse=True)))
+def _missing(answer: Answer, c: Candidate, judge: Stretches) -> float:
+    """The held-out error with all causes but one."""
+    return judge.error(answer.search.fit(without(answer.causes, (c,)), (answer.causes, answer.fit)))
 
 
 def _refitted(answer: Answer) -> dict[str, dict[str, Any]]:
@@ -224,12 +282,10 @@ def _length(measured: Dataset, model: Model, window: float | None) -> int:
 
 def _named(answer: Answer, c: Candidate, judge: Stretches) -> Cause:
     """A cause with its numbers, its share, its runner-up, and what speaks against it."""
-    library, last = answer.library, answer.fit
-    rest = tuple(k for k in answer.causes if k is not c)
-    before = judge.error(answer.search.fit(rest, (answer.causes, last)))
+    library, last, before = answer.library, answer.fit, _missing(answer, c, judge)
     runner_up = None
     for rival, fitted in answer.rivals[c.key][:1]:
-        other = next(k for k in rival if k.key not in {r.key for r in rest})
+        other = without(rival, without(answer.causes, (c,)))[0]
         runner_up = Rival(
             *other.key, _share(judge.error(fitted), before), answer.search.better(last, fitted), judge.rms(fitted)
         )
@@ -261,10 +317,8 @@ def _read(answer: Answer, c: Candidate, numbers: Mapping[str, float], judge: Str
     before = judge.error(answer.fit) ** 2
     # All of the noise floor, where the rounding is most of it.
     left = max(0.0, before - m.sigma[channel] ** 2 / m.spread[channel] ** 2 / len(m.channels))
-    known = {
-        p.name: Estimate.of(numbers[n], unit=unit)
-        for p, n, unit in zip(c.effect.parameters, library.names(c), library.units(c), strict=True)
-    }
+    rows = zip(library.parameters(c).items(), library.units(c), strict=True)
+    known = {p.name: Estimate.of(numbers[n], unit=unit) for (n, p), unit in rows}
     return Cause(*c.key, known, _share(math.sqrt(left), math.sqrt(before)))
 
 

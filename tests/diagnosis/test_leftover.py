@@ -17,7 +17,7 @@ from gapcert_diagnosis.residual import unexplained as leftover
 from gapcert_diagnosis.residual import whiteness
 from gapcert_diagnosis.residual.lack_of_fit import lack
 from gapcert_diagnosis.residual.regression import features
-from gapcert_diagnosis.residual.tests import evidence
+from gapcert_diagnosis.residual.unexplained import evidence
 from gapcert_diagnosis.search.candidates import Library
 from gapcert_diagnosis.testing import ROD, equations
 
@@ -239,7 +239,7 @@ def test_products_of_what_forces_make_need_no_outputs():
     gone = np.linalg.qr(motion.project(np.random.default_rng(0).standard_normal((*motion.residual.shape, 2))).reshape(-1, 2))[0]
     r = motion.project(motion.residual).reshape(-1, 1)
     r -= gone @ (gone.T @ r)
-    rows = np.concatenate([motion.free, *(a.reshape(*motion.residual.shape, -1) for a in (gone, r))], axis=2)
+    rows = np.concatenate([motion.linear.free, *(a.reshape(*motion.residual.shape, -1) for a in (gone, r))], axis=2)
     forces = lackoffit._Forces.of(motion, "q", *motion.linear.adjoint(rows))
     columns = forces.columns(force)
     assert len(columns.which) == made.shape[1]
@@ -276,7 +276,7 @@ def test_noise_that_starts_follow_has_the_sums_that_are_expected():
     for d, j in ((0, 0), (1, 5)):
         cover = np.zeros((length, ny, length, ny))
         cover[:, d, :, d] = whiteness.THRESHOLDS.noise_colours[j] ** gap
-        keep = np.eye(length * ny) - found.short.free @ np.swapaxes(found.short.free, 1, 2)
+        keep = np.eye(length * ny) - found.short.linear.free @ np.swapaxes(found.short.linear.free, 1, 2)
         left_over = (keep @ cover.reshape(length * ny, -1) @ keep).reshape(w, length, ny, length, ny)
         sums = whiteness._Expected.of(found.short, found.long).short[..., d, j]
         for k, c in ((0, 0), (0, 1), (3, d)):

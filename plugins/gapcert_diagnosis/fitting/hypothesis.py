@@ -6,7 +6,7 @@ What hidden states remember where the history of a window begins is carried ther
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import final
@@ -47,13 +47,9 @@ class Hypothesis:
         """Σ ((θ − θ₀)/sd)² of theta (…, p)."""
         return np.asarray(np.sum(((theta - self.value) / self.sd) ** 2, axis=-1))
 
-    def holding(self, theta: Array, keep: Sequence[str] = ()) -> Hypothesis:
-        """With the numbers fixed at theta, except those named in `keep`."""
-        free = np.array([n in keep for n in self.names], dtype=bool)
-        fixed = {**self.fixed, **{n: float(v) for n, v, f in zip(self.names, theta, free, strict=True) if not f}}
-        names = tuple(n for n in self.names if n in keep)
-        value, low, high, step, sd = (p[free] for p in (self.value, self.low, self.high, self.step, self.sd))
-        return Hypothesis(self.model, names, value, low, high, step, sd, fixed)
+    def holding(self, theta: Array) -> Hypothesis:
+        """With all numbers fixed at theta."""
+        return Hypothesis(self.model, fixed={**self.fixed, **dict(zip(self.names, theta.tolist(), strict=True))})
 
     def simulate(self, windows: Windows, theta: Array, start: Array) -> Array:
         """Outputs (b, W, L, ny) from theta (b, p) and starts (b, W, nx), at the times of the samples.

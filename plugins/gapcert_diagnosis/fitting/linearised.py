@@ -260,11 +260,6 @@ class Tangent:
         residual = -fitted.residual.reshape(len(windows), -1)
         return cls(model, windows, fitted, x, u, LinearisedMotion(A, observe, m.repeat), residual)
 
-    @property
-    def free(self) -> Array:
-        """An orthonormal basis (W, L·ny, nx) of what the start of a window makes."""
-        return self.linear.free
-
     def responses(self, site: str, force: Array) -> Array:
         """What forces (W, S, K) at a site do to the measured channels, (W, L·ny, K), with the starts free to follow."""
         return self.driven(self.probed(site).reshape(self.x.shape), force)

@@ -11,7 +11,7 @@ from typing import Any, final
 import numpy as np
 
 from gapcert.plugin import Array, Emit, Event, Model, Recording, UsageError, difference
-from gapcert_diagnosis.problem import Diagnoser, DiagnosisProblem
+from gapcert_diagnosis.diagnose import Diagnoser, DiagnosisProblem
 from gapcert_diagnosis.results import Cause, Diagnosis, Estimate, Gain, Misfit, Rival, Verdict
 from gapcert_diagnosis.search.criterion import agreement
 from gapcert_diagnosis.thresholds import THRESHOLDS
@@ -166,13 +166,9 @@ def _estimates(best: NativeFit, c: NativeCandidate, seed: int) -> dict[str, Esti
 
 
 def _verdict(causes: tuple[Cause, ...], left: Mapping[str, float], before: float, after: float) -> Verdict:
-    if causes:
-        return (
-            "causes"
-            if after < (1 - THRESHOLDS.enough_explained) * before or max(left.values()) <= THRESHOLDS.left_errors
-            else "unexplained"
-        )
-    return "nothing" if max(left.values()) <= THRESHOLDS.left_errors else "unexplained"
+    if max(left.values()) <= THRESHOLDS.left_errors:
+        return "causes" if causes else "nothing"
+    return "causes" if causes and after < (1 - THRESHOLDS.enough_explained) * before else "unexplained"
 
 
 def _misfits(search: EngineSearch, best: NativeFit) -> dict[str, Misfit]:

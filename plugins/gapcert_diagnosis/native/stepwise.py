@@ -192,15 +192,13 @@ class EngineSearch:
             return NativeFit(causes, start.model)
         same = start.causes == causes and len(start.z) == len(free)  # the point that was judged, to the last bit
         first = start.z if same else np.array([c.to(now[c.native]) for c in free])
-        bounds = [_bounds(c) for c in free]
         radius = np.full(len(free), THRESHOLDS.first_radius)
         if (s := start.surface) is not None:  # numbers that were known before come first
             known = s.radius if len(s.radius) <= len(free) else s.radius.max()
             radius[: len(s.radius)] = np.clip(known, 2 * THRESHOLDS.least_radius, THRESHOLDS.first_radius)
         enough = None if start.surface is None else THRESHOLDS.surface_error
-        z, surface = descend(
-            lambda p: self.scores(_restated(start.model, free, p), motions), first, bounds, radius, rounds, enough
-        )
+        bounds, scores = [c.bounds for c in free], lambda p: self.scores(_restated(start.model, free, p), motions)
+        z, surface = descend(scores, first, bounds, radius, rounds, enough)
         return NativeFit(causes, _restated(start.model, free, z), z, surface)
 
     def outdoes(self, new: NativeFit, best: NativeFit) -> bool:
@@ -260,15 +258,6 @@ def _tolerated(fitted: NativeFit) -> bool:
     """Is what the last cause changes within the tolerance that was stated?"""
     p = fitted.causes[-1].parameter
     return p is not None and abs(fitted.model.values[p.name] - p.value) <= p.tolerance
-
-
-def _bounds(c: NativeCandidate) -> tuple[float, float]:
-    assert c.parameter is not None
-    p = c.parameter
-    low = c.to(p.low) if np.isfinite(p.low) and not c.logarithmic else -np.inf
-    if c.logarithmic:
-        low = math.log(max(p.low / p.value, 1e-4))
-    return low, c.to(p.high) if np.isfinite(p.high) else np.inf
 
 
 def _named(causes: Causes) -> str:

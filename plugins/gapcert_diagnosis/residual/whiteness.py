@@ -155,7 +155,7 @@ def _squares(rows: Array) -> Array:
 def _sums(motion: Tangent, lags: int) -> Array:
     """Expected lagged sums of P ε per unit of each noise: P Γ P = Γ − QQᵀΓ − ΓQQᵀ + Q(QᵀΓQ)Qᵀ, (lags + 1, ny, ny, J)."""
     w, length, ny = motion.windows.y.shape
-    basis = motion.free.reshape(w, length, ny, -1).transpose(2, 0, 3, 1)
+    basis = motion.linear.free.reshape(w, length, ny, -1).transpose(2, 0, 3, 1)
     gap = np.abs(np.subtract.outer(np.arange(length), np.arange(length)))
     covers, kinds = [colour**gap for colour in THRESHOLDS.noise_colours], len(THRESHOLDS.noise_colours)
     out, square = np.zeros((lags + 1, ny, kinds * ny)), np.zeros((ny, length, length))
@@ -212,7 +212,7 @@ class _Logged:
     @classmethod
     def of(cls, motion: Tangent) -> _Logged:
         w, length, ny = motion.windows.y.shape
-        free = motion.free.reshape(w, length, ny, -1).transpose(0, 2, 1, 3)
+        free = motion.linear.free.reshape(w, length, ny, -1).transpose(0, 2, 1, 3)
         return cls(w, length, free.reshape(w, ny * length, -1))
 
     def residual(self, logs: Array) -> Array:

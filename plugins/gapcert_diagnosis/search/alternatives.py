@@ -8,7 +8,6 @@ from typing import final
 
 import numpy as np
 
-from gapcert.plugin import EffectParameter
 from gapcert_diagnosis.data.dataset import Dataset, Windows
 from gapcert_diagnosis.fitting.fit import Fit
 from gapcert_diagnosis.results import Seen
@@ -163,14 +162,10 @@ def _implausible(library: Library, c: Candidate, fitted: Fit) -> dict[str, tuple
     if stated == 0:
         return {}
     known, scales = fitted.values, library.scales(c)
-    limits = {n: (p.plausible[0] * p.scale(scales), p.plausible[1] * p.scale(scales)) for p, n in _numbers(library, c)}
+    limits = {n: (p.plausible[0] * p.scale(scales), p.plausible[1] * p.scale(scales)) for n, p in library.parameters(c).items()}
     if stated is not None and stated < 0:
         limits = {n: (-high, -low) for n, (low, high) in limits.items()}
     return {n: ends for n, ends in limits.items() if not ends[0] <= known[n] <= ends[1]}
-
-
-def _numbers(library: Library, c: Candidate) -> list[tuple[EffectParameter, str]]:
-    return list(zip(c.effect.parameters, library.names(c), strict=True))
 
 
 def flags(library: Library, c: Candidate, fitted: Fit) -> tuple[str, ...]:
@@ -178,7 +173,7 @@ def flags(library: Library, c: Candidate, fitted: Fit) -> tuple[str, ...]:
     known, out = fitted.values, []
     low, high = library.bounds(c)
     implausible = _implausible(library, c, fitted)
-    for i, ((p, name), off) in enumerate(zip(_numbers(library, c), library.off(c), strict=True)):
+    for i, ((name, p), off) in enumerate(zip(library.parameters(c).items(), library.off(c), strict=True)):
         value, unit = known[name], f" {library.units(c)[i]}".removesuffix(" 1")
         if name in implausible:
             least, most = implausible[name]

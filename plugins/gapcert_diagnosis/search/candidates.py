@@ -94,7 +94,7 @@ class Library:
         channel = [s.name for s in self.measured.channels].index(c.site)
         values, weights = (np.concatenate(a)[:, channel] for a in (self.measured.outputs, self.measured.weights))
         found = c.effect.seen_in(values[weights > 0])
-        return None if found is None else dict(zip(self.names(c), (found[p.name] for p in c.effect.parameters), strict=True))
+        return None if found is None else {n: found[p.name] for n, p in self.parameters(c).items()}
 
     def _roughened(self, c: Candidate, found: Mapping[str, float]) -> Dataset:
         """With a noise floor of at least what the effect does to its channel over the range of the motion."""
@@ -193,6 +193,10 @@ class Library:
         """What a candidate's parameters are called in the extended model."""
         return tuple(p.name for p in self._numbers(c))
 
+    def parameters(self, c: Candidate) -> dict[str, EffectParameter]:
+        """By these names, the parameters of the effect."""
+        return dict(zip(self.names(c), c.effect.parameters, strict=True))
+
     def units(self, c: Candidate) -> tuple[str, ...]:
         return tuple(p.unit for p in self._numbers(c))
 
@@ -248,7 +252,7 @@ class Library:
                 step = THRESHOLDS.nuisance_step * (stated.tolerance if doubt is None else THRESHOLDS.doubt_starts[-1] * doubt)
                 rows.append((stated.name, stated.value, low[0], high[0], step, math.inf))
                 continue
-            for i, (name, e) in enumerate(zip(self.names(c), c.effect.parameters, strict=True)):
+            for i, (name, e) in enumerate(self.parameters(c).items()):
                 rows.append((name, e.off, low[i], high[i], _step(e, e.scale(self.scales(c))), math.inf))
         names = tuple(r[0] for r in rows)
         return Hypothesis(model, names, *np.array([r[1:] for r in rows], dtype=np.float64).reshape(-1, 5).T)

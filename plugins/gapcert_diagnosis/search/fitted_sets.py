@@ -163,9 +163,7 @@ class FittedSets:
     def carry(self, old: Candidate, new: Candidate, found: Found, default: bool = True) -> dict[str, float]:
         """First values of one law from those of another that it contains, or that contains it."""
         fitted = found[1].values
-        mine, theirs = (
-            dict(zip((p.name for p in c.effect.parameters), self.library.names(c), strict=True)) for c in (new, old)
-        )
+        mine, theirs = ({p.name: n for n, p in self.library.parameters(c).items()} for c in (new, old))
         out: dict[str, float] = self._first((new,), ((), self.nothing)) if default else {}
         for m, t in new.effect.contains.get(old.effect.name, {}).items():
             out[mine[m]] = fitted[theirs[t]]
