@@ -231,13 +231,12 @@ def _single(found: list[tuple[float, Push]]) -> tuple[Push, ...]:
 
 def evidence(found: Left) -> dict[str, dict[str, float]]:
     """Test → channel → number for the residual of the final model; tests of the missing force are by coordinate."""
-    long, names = found.long, [c.name for c in found.long.windows.measured.channels]
+    long, m = found.long, found.long.windows.measured
     r: Array = long.residual.reshape(long.windows.y.shape)
     brief: Array = found.short.residual.reshape(found.short.windows.y.shape)
-    m = long.windows.measured
 
     def by(values: Array) -> dict[str, float]:
-        return dict(zip(names, map(float, values), strict=True))
+        return dict(zip((c.name for c in m.channels), map(float, values), strict=True))
 
     out = {
         "mean square": by(np.mean(r**2, axis=(0, 1))),
