@@ -211,7 +211,7 @@ class _Data:
         """What is held out, one per horizon; as an answer holds the inputs, and as its fit finds starts best."""
         if answer is None:
             return stretches(self.held, horizons)
-        return stretches(self.held.with_hold(answer.dataset.hold), horizons, answer.dataset, answer.fit)
+        return stretches(replace(self.held, hold=answer.dataset.hold), horizons, answer.dataset, answer.fit)
 
 
 def _warned(emit: Emit, fitted: Dataset, held: Dataset) -> None:

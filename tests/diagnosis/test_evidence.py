@@ -113,7 +113,7 @@ def test_intervals_hold_the_truth_when_nothing_is_hidden(effect):
         c = search.library.candidates[0]
         fitted = search.fit((c,), ((), search.nothing))
         inside.append(abs(fitted.theta[0]) <= 1.5 * fitted.interval()[0])
-        assert better(fitted, search.nothing) < search.library.threshold
+        assert better(fitted, search.nothing) < search.library.charge()
     assert sum(inside) >= 3
 
 

@@ -77,7 +77,7 @@ def test_noise_of_any_colour_is_nothing(colour, velocity):
         assert all(k.share < leftover.THRESHOLDS.learnt_share for k in found.learnt)
         assert leftover.verdict(0, found, last, last, experiment=False) == "nothing"
     # Against the white noise floor alone, coloured noise looks like something that grows.
-    assert found.growth.growth > 1.06 or colour < 0.6
+    assert found.growth.chi_long > 1.06 * max(found.growth.chi_short, 1.0) or colour < 0.6
 
 
 @pytest.mark.parametrize("colour", [0.0, 0.8])

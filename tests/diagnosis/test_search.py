@@ -112,7 +112,7 @@ def test_what_hides_in_the_stated_values_is_screened_by_its_prior():
     search = FittedSets(library, windows)
     _, long = search.promises(((), search.nothing))
     (mass,) = (s for s in long if keys(s.move) == {("parameter", "m")})
-    assert mass.gain > library.threshold
+    assert mass.gain > library.charge()
     assert mass.values["m"] == pytest.approx(1.25, rel=0.1)
     answer = named(model, recording)
     assert {("parameter", "m")} in [keys(answer.causes), *(keys(t) for t, _ in answer.ties)]
@@ -281,7 +281,7 @@ def test_what_would_have_been_seen_is_of_the_size_that_is_seen():
         _, hidden = simulated(LOOSE, [("viscous-friction", "q", (factor * least.value,))])
         search = FittedSets(*prepared(model, hidden))
         (c,) = (c for c in library.candidates if c.effect.name == "viscous-friction")
-        assert (better(search.fit((c,), ((), search.nothing)), search.nothing) > library.threshold) == seen
+        assert (better(search.fit((c,), ((), search.nothing)), search.nothing) > library.charge()) == seen
 
 
 def test_values_that_are_not_plausible_are_flagged():
@@ -363,6 +363,6 @@ def test_a_larger_set_must_pay_for_itself_on_whatever_path_it_was_found():
     )
     few = (viscous,), search.fit((viscous,), None)
     more = (viscous, dry), search.fit((viscous, dry), few)
-    assert search.better(more[1], few[1]) > library.threshold
+    assert search.better(more[1], few[1]) > library.charge()
     assert not EquationSearch(search).outdoes(more, few)
     assert EquationSearch(search).outdoes(few, ((), search.nothing))

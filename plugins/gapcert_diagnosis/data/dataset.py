@@ -122,10 +122,6 @@ class Dataset:
         """Is there no noise, as in what a simulator says?"""
         return bool((self.sigma <= (1 + 1e-9) * THRESHOLDS.least_floor * self.spread).all())
 
-    def with_hold(self, hold: Hold | None) -> Dataset:
-        """The same data with the input held in a given way."""
-        return replace(self, hold=hold)
-
     def samples(self, seconds: float) -> int:
         return max(1, round(seconds / self.period))
 
@@ -225,7 +221,7 @@ class Windows:
 
     def with_hold(self, hold: Hold) -> Windows:
         """The same windows with the input held in a given way."""
-        return replace(self, measured=self.measured.with_hold(hold))
+        return replace(self, measured=replace(self.measured, hold=hold))
 
     def retraced(self, x: Array) -> tuple[Windows, npt.NDArray[np.bool_]]:
         """The same windows in a recording whose guessed states are those of motions x (W, L, nx), as far as these reach.

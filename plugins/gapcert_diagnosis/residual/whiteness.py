@@ -23,9 +23,8 @@ class Growth:
     """How much more is left in long windows than stationary noise with the colour of short ones would leave there.
 
     A missing force adds up over a window; noise, coloured or not, does not. chi_long, chi_short: mean squares in units of the
-    white noise floor; growth = chi_long/max(chi_short, 1); beyond (ny,): measured over predicted mean square of the long
-    windows; sigmas: of the largest log(beyond), in standard deviations of that noise; excess (ny,): the part of the mean square
-    that the noise does not explain.
+    white noise floor; beyond (ny,): measured over predicted mean square of the long windows; sigmas: of the largest
+    log(beyond), in standard deviations of that noise; excess (ny,): the part of the mean square that noise does not explain.
     """
 
     chi_long: float
@@ -33,10 +32,6 @@ class Growth:
     beyond: Array
     sigmas: float
     excess: Array
-
-    @property
-    def growth(self) -> float:
-        return self.chi_long / max(self.chi_short, 1.0)
 
 
 def growth(long: Tangent, short: Tangent, seed: int = 0) -> Growth:

@@ -193,7 +193,7 @@ def smallest(search: FittedSets) -> tuple[Seen, ...]:
     library, out = search.library, []
     (table,) = search.screen.tables([(search.nothing, 1)])
     for c in library.candidates:
-        (low, high), row = library.bounds(c), table.least(c, library.threshold)
+        (low, high), row = library.bounds(c), table.least(c, library.charge())
         if row is not None and (row >= low).all() and (row <= high).all():
             out.append(Seen(*c.key, c.effect.parameters[0].name, float(row[0]), library.units(c)[0]))
     return tuple(out)

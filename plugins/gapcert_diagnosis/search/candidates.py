@@ -110,13 +110,8 @@ class Library:
         groups = [tuple(g) for _, g in itertools.groupby(self.candidates, key=lambda c: c.effect.name)]
         return [g for g in groups if len(g) > 1 and g[0].effect.site in ("coordinate", "input")]
 
-    @property
-    def threshold(self) -> float:
-        """The fall in score that a cause must bring."""
-        return self.charge()
-
     def charge(self, settings: int = 0) -> float:
-        """The same for one that was chosen among so many settings as well: more rivals tried, more needed."""
+        """The fall in score that a cause must bring, chosen among so many settings as well: more rivals tried, more needed."""
         return 12 + 2 * math.log(max(1, len(self.candidates) + settings))
 
     def extension(self, c: Candidate) -> Extension:

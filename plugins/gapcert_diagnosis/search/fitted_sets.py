@@ -179,7 +179,7 @@ class FittedSets:
 
     def charges(self, found: Found, before: Found) -> tuple[float, float | None]:
         """What a larger set must bring: where samples are counted, and where a cautious search finds both fits rough."""
-        return self.library.threshold, rough_charge(self.library, found[0], before[0]) if self.cautious else None
+        return self.library.charge(), rough_charge(self.library, found[0], before[0]) if self.cautious else None
 
     def small(self, found: Found) -> dict[tuple[str, str], float]:
         """(effect, site) → share of the effort of causes that are too small to be named."""

@@ -77,7 +77,7 @@ class EquationSearch:
         if best[1].rough:
             sets.cautious = True
             first, best = self.refine(best), self.forward()
-            most = max(1, len(first[0]) - len(best[0])) * sets.library.threshold
+            most = max(1, len(first[0]) - len(best[0])) * sets.library.charge()
             best = first if sets.better(first[1], best[1]) > most and sets.matters(first) else best
         return self.try_pairs(best)
 
@@ -144,7 +144,7 @@ class EquationSearch:
         promised = [s for table in sets.screen.tables(sets.fits(nothing)) for s in table.pairs(THRESHOLDS.paired_short_fits)]
         most = max((s.gain for s in promised), default=0.0)
         silent = noise(found[1], THRESHOLDS.sure_errors) and bool(found[0])
-        if most < (THRESHOLDS.paired_share * self._explained(found[1]) if silent else 2 * sets.library.threshold):
+        if most < (THRESHOLDS.paired_share * self._explained(found[1]) if silent else 2 * sets.library.charge()):
             return found
         now = sets.fit_further(now)
         moves = {keys(s.move): s for s in reversed(promised)}
@@ -154,7 +154,7 @@ class EquationSearch:
             if beats(first, now, sets.cautious, fewer=len(causes) < len(best[0])):
                 new = self.refine((causes, sets.fit(causes, nothing, sets.fit_further(first).values)))
                 more = beats(new[1], best[1], sets.cautious, fewer=len(new[0]) < len(best[0]))
-                enough = sets.better(new[1], sets.nothing) > len(new[0]) * sets.library.threshold
+                enough = sets.better(new[1], sets.nothing) > len(new[0]) * sets.library.charge()
                 if more and enough and sets.pays(new, nothing) and sets.matters(new):
                     best = new
         return best
