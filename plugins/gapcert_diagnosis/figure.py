@@ -19,13 +19,13 @@ import numpy.typing as npt
 from gapcert.plugin import Array, Extension, Model, difference, site_units
 from gapcert_figures import Channel, Correlation, Course, DiagnosisFigure, Law, Signal, Waterfall, called
 
-from .data.dataset import Windows, flat
+from .data.dataset import Windows, flat, once
 from .fitting.fit import Fit
 from .fitting.hypothesis import Hypothesis
-from .fitting.linearised import Tangent
+from .fitting.linearised import Tangent, sliding, velocity
 from .fitting.rollout_error import Stretches
 from .results import Correction, Experiment
-from .search.candidates import Candidate, Causes, Library, once, sliding, velocity
+from .search.candidates import Candidate, Causes, Library
 from .thresholds import THRESHOLDS
 
 if TYPE_CHECKING:

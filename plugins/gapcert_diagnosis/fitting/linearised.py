@@ -14,13 +14,13 @@ from typing import final
 
 import numpy as np
 
-from gapcert.plugin import Array, Model, difference
-from gapcert_diagnosis.data.dataset import Windows, flat
-from gapcert_diagnosis.search.candidates import once, probe, velocity
+from gapcert.plugin import Array, Extension, Model, Parameter, difference, site_units
+from gapcert_diagnosis.data.dataset import Windows, flat, once
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .fit import Fit
 from .hypothesis import nudges, recalled
+from .step_size import built
 
 
 @final
@@ -324,3 +324,33 @@ def _slopes(model: Model, x: Array, u: Array) -> Array:
     moved = np.concatenate([x, *(x + size * e for e in np.eye(nx))])
     new = model.along(moved, np.tile(u, (nx + 1, 1, 1))).reshape(nx + 1, *x.shape)
     return np.asarray(np.moveaxis(difference(model.states, new[1:], new[:1]), 0, -1) / size)
+
+
+def sliding(model: Model, site: str, x: Array, u: Array, plain: Array | None = None) -> Array:
+    """∂x⁺/∂f (n, nx) of the machine as it slides: what turns a change of the state into a force, also where friction holds."""
+    spec = model.to_spec()
+    if spec.get("dry_friction"):
+        return probe(built({**spec, "dry_friction": {}}), site, x, u)
+    return probe(model, site, x, u, plain)
+
+
+def probe(model: Model, site: str, x: Array, u: Array, plain: Array | None = None) -> Array:
+    """∂x⁺/∂f (n, nx) for a force f at a coordinate, held for one period; plain: x⁺ without it, where that is known."""
+    if "forces" in model.capabilities:
+        forces = np.zeros((len(x), model.substeps, len(model.coordinates)))
+        forces[..., model.coordinates.index(site)] = 1.0
+        plain = model.step(x, u).x if plain is None else plain
+        return difference(model.states, model.step(x, u, forces=forces).x, plain)
+    force = Parameter("probe_force", 0.0, site_units(model, "coordinate", site)["force"])
+    pushed = model.extend([Extension("probe", site, (force,), force=force.name)])
+    on, off = (pushed.step(x, u, parameters={"probe_force": f}).x for f in (1.0, 0.0))
+    return difference(model.states, on, off)
+
+
+def velocity(model: Model, site: str, response: Array) -> int:
+    """The column of the state that a force at `site` changes first: its velocity, or the state whose equation the site is."""
+    names = [s.name for s in model.states]
+    for name in (f"{site}_dot", site):
+        if name in names:
+            return names.index(name)
+    return int(np.argmax(np.abs(response).max(axis=0)))

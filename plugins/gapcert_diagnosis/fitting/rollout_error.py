@@ -9,7 +9,7 @@ from typing import final
 import numpy as np
 
 from gapcert.plugin import Array, UsageError, difference
-from gapcert_diagnosis.data.dataset import Dataset, Windows
+from gapcert_diagnosis.data.dataset import Dataset, Windows, once
 from gapcert_diagnosis.results import Gain
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
@@ -42,9 +42,7 @@ class Stretches:
 
     def simulate(self, fitted: Fit) -> Array:
         """Outputs (W, H, ny) of free rollouts; each fit is rolled out once."""
-        if id(fitted) not in self._rolled:
-            self._rolled[id(fitted)] = fitted, *self._simulated(fitted)
-        return self._rolled[id(fitted)][1]
+        return once(self._rolled, id(fitted), lambda: (fitted, *self._simulated(fitted)))[1]
 
     def _simulated(self, fitted: Fit) -> tuple[Array, Array]:
         """(outputs, starts); the search for starts begins where that of another fit ended, or at what was measured."""

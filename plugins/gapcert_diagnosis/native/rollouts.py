@@ -15,7 +15,7 @@ from typing import final
 import numpy as np
 
 from gapcert.plugin import DAMAGE, Array, Recording, UsageError, difference, npz_bytes, rotated, write_atomic
-from gapcert_diagnosis.search.candidates import once
+from gapcert_diagnosis.data.dataset import once
 from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_engines import Group, NativeModel
 

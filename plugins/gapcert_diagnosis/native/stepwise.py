@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import norm
 
 from gapcert.plugin import Array, GapcertError
-from gapcert_diagnosis.search.candidates import once
+from gapcert_diagnosis.data.dataset import once
 from gapcert_diagnosis.search.criterion import agreement
 from gapcert_diagnosis.search.selection import drop, forward
 from gapcert_diagnosis.thresholds import THRESHOLDS

@@ -4,26 +4,17 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypeVar, final
+from typing import final
 
 import numpy as np
 
-from gapcert.plugin import (
-    Array,
-    Effect,
-    EffectParameter,
-    Extension,
-    Model,
-    Parameter,
-    difference,
-    position,
-    site_units,
-)
-from gapcert_diagnosis.data.dataset import Dataset
+from gapcert.plugin import Array, Effect, EffectParameter, Extension, Model, Parameter, difference, position
+from gapcert_diagnosis.data.dataset import Dataset, once
 from gapcert_diagnosis.fitting.hypothesis import Hypothesis
+from gapcert_diagnosis.fitting.linearised import sliding, velocity
 from gapcert_diagnosis.fitting.step_size import built
 from gapcert_diagnosis.results import ORDER
 from gapcert_diagnosis.thresholds import THRESHOLDS
@@ -45,15 +36,6 @@ class Candidate:
 
 
 Causes = tuple[Candidate, ...]
-K = TypeVar("K")
-V = TypeVar("V")
-
-
-def once(known: dict[K, V], key: K, make: Callable[[], V]) -> V:
-    """What is kept under a key, made the first time."""
-    if key not in known:
-        known[key] = make()
-    return known[key]
 
 
 @final
@@ -300,36 +282,6 @@ def _restated(model: Model, values: Mapping[str, float]) -> Model:
     spec = model.to_spec()
     stated, units = spec["parameters"], {p.name: p.unit for p in model.parameters}
     return built(spec | {"parameters": stated | {n: {**stated[n], "value": f"{v!r} {units[n]}"} for n, v in values.items()}})
-
-
-def sliding(model: Model, site: str, x: Array, u: Array, plain: Array | None = None) -> Array:
-    """∂x⁺/∂f (n, nx) of the machine as it slides: what turns a change of the state into a force, also where friction holds."""
-    spec = model.to_spec()
-    if spec.get("dry_friction"):
-        return probe(built({**spec, "dry_friction": {}}), site, x, u)
-    return probe(model, site, x, u, plain)
-
-
-def probe(model: Model, site: str, x: Array, u: Array, plain: Array | None = None) -> Array:
-    """∂x⁺/∂f (n, nx) for a force f at a coordinate, held for one period; plain: x⁺ without it, where that is known."""
-    if "forces" in model.capabilities:
-        forces = np.zeros((len(x), model.substeps, len(model.coordinates)))
-        forces[..., model.coordinates.index(site)] = 1.0
-        plain = model.step(x, u).x if plain is None else plain
-        return difference(model.states, model.step(x, u, forces=forces).x, plain)
-    force = Parameter("probe_force", 0.0, site_units(model, "coordinate", site)["force"])
-    pushed = model.extend([Extension("probe", site, (force,), force=force.name)])
-    on, off = (pushed.step(x, u, parameters={"probe_force": f}).x for f in (1.0, 0.0))
-    return difference(model.states, on, off)
-
-
-def velocity(model: Model, site: str, response: Array) -> int:
-    """The column of the state that a force at `site` changes first: its velocity, or the state whose equation the site is."""
-    names = [s.name for s in model.states]
-    for name in (f"{site}_dot", site):
-        if name in names:
-            return names.index(name)
-    return int(np.argmax(np.abs(response).max(axis=0)))
 
 
 def _scales(library: Library, c: Candidate, x: Array, u: Array) -> dict[str, float]:

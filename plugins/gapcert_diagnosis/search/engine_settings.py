@@ -12,11 +12,11 @@ from typing import final
 import numpy as np
 
 from gapcert.plugin import Effect, Model, UsageError, Variant
-from gapcert_diagnosis.data.dataset import Windows
+from gapcert_diagnosis.data.dataset import Windows, once
 from gapcert_diagnosis.fitting.fit import Fit, fit, stepped
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
-from .candidates import Causes, Library, once
+from .candidates import Causes, Library
 from .criterion import Found, better, noise, setting_pays, without
 from .fitted_sets import FittedSets
 from .moves import additions

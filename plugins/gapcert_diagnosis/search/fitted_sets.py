@@ -7,11 +7,11 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import final
 
-from gapcert_diagnosis.data.dataset import Windows
+from gapcert_diagnosis.data.dataset import Windows, once
 from gapcert_diagnosis.fitting.fit import Fit, carried, fit, rescued
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
-from .candidates import Candidate, Causes, Library, once
+from .candidates import Candidate, Causes, Library
 from .criterion import Found, Keys, better, decides, keys, named, noise, pays, rough_charge
 from .gains import Promise
 from .screening import Screen, standing_in

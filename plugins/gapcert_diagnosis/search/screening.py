@@ -17,12 +17,12 @@ from typing import Any, final
 import numpy as np
 
 from gapcert.plugin import Array, Model, difference
-from gapcert_diagnosis.data.dataset import Windows, flat
+from gapcert_diagnosis.data.dataset import Windows, flat, once
 from gapcert_diagnosis.fitting.fit import Fit
-from gapcert_diagnosis.fitting.linearised import Motion, Path
+from gapcert_diagnosis.fitting.linearised import Motion, Path, sliding, velocity
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
-from .candidates import Candidate, Causes, Library, once, sliding, velocity
+from .candidates import Candidate, Causes, Library
 from .gains import GainTable, Promise, Push
 
 ROWS = 512  # motions that are stepped together: more no longer stay near the processor
