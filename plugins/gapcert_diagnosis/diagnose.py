@@ -145,8 +145,8 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
     limits = Limits.of(data.library.model, dataset, asked.get("limits"), asked.get("seconds", 12.0))
     design = told_apart(answer.causes, answer.fit, answer.ties, dataset, limits, seed)[0]
     lap("experiment")
-    left = leftover.left(data.library.extended(answer.causes, answer.fit.values), answer.fit, answer.windows, seed)
-    doubted = doubt(answer.fit, answer.windows)
+    left = leftover.left(data.library.extended(answer.causes, answer.fit.values), answer.fit, seed)
+    doubted = doubt(answer.fit)
     verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, design is not None, bool(doubted))
     lap("leftover")
     ties = [tuple(c.key for c in tie) for tie, _ in answer.ties]
@@ -171,7 +171,7 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
         assumptions=(*data.assumptions, *doubted),
         # How long the experiments were, of which none tells the ties apart.
         seconds=limits.seconds if answer.ties and limits.inputs and not design else None,
-        warnings=coarse(answer.fit, answer.windows),
+        warnings=coarse(answer.fit),
         refitted=_refitted(answer),
     )
 

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from gapcert.plugin import Array, Extension, Model, difference, site_units
 from gapcert_figures import Channel, Correlation, Course, DiagnosisFigure, Law, Signal, Waterfall, called
 
-from .data.dataset import Windows, flat, once
+from .data.dataset import flat, once
 from .fitting.fit import Fit
 from .fitting.hypothesis import Hypothesis
 from .fitting.linearised import Tangent, sliding, velocity
@@ -56,14 +56,13 @@ def figure(
     fits = [f for _, f in steps]
     if plain is not None:
         named, fits = [plain[0], *named], [plain[1], *fits]
-    first, windows = fits[0], search.windows
-    path = _Fitted(search.library, causes, last, windows)
+    first, path = fits[0], _Fitted(search.library, causes, last)
     return DiagnosisFigure(
         _channels(judge, first, last),
         _laws(path, correction) + _outputs(path),
         Waterfall(("none of the causes", *named), np.array([judge.error(f) for f in fits])) if named else None,
-        tuple(_correlations(windows, first, last)),
-        tuple(_courses(windows, first, last)),
+        tuple(_correlations(first, last)),
+        tuple(_courses(first, last)),
         () if design is None else _signals(design, search.library.model),
     )
 
@@ -79,9 +78,9 @@ def _channels(judge: Stretches, first: Fit, last: Fit) -> tuple[Channel, ...]:
     return tuple(Channel(c.name, c.unit, t, y[:, i], before[k, :, i], after[k, :, i]) for i, c in enumerate(m.channels))
 
 
-def _correlations(windows: Windows, first: Fit, last: Fit) -> list[Correlation]:
+def _correlations(first: Fit, last: Fit) -> list[Correlation]:
     """Per channel the residual's autocorrelation, and its correlation with the input that it follows most."""
-    m, model = windows.measured, last.hypothesis.model
+    windows, m, model = last.windows, last.windows.measured, last.hypothesis.model
     reach = min(max(m.samples(LAGS), SLOW), windows.length // 2)
     band = 1.96 / math.sqrt(last.residual.shape[0] * last.residual.shape[1])
     inputs = windows.u[:, m.history :]
@@ -108,8 +107,8 @@ def correlation(a: Array, b: Array, reach: int) -> Array:
     return np.asarray(np.concatenate([sums[count - reach :], sums[: reach + 1]]) / (size + 1e-300))
 
 
-def _courses(windows: Windows, first: Fit, last: Fit) -> list[Course]:
-    seen = np.sum(windows.weight**2, axis=(1, 2))
+def _courses(first: Fit, last: Fit) -> list[Course]:
+    windows, seen = last.windows, np.sum(last.windows.weight**2, axis=(1, 2))
     rms = [np.sqrt(np.sum(f.residual**2, axis=(1, 2)) / seen) for f in (first, last)]
     out = []
     for i in np.unique(windows.trajectory):
@@ -157,11 +156,11 @@ class _Place:
 class _Fitted:
     """The last fit along its own motion: what each cause adds there, and what small further forces would do."""
 
-    def __init__(self, library: Library, causes: Causes, fitted: Fit, windows: Windows) -> None:
-        self.library, self.causes, self.windows = library, causes, windows
+    def __init__(self, library: Library, causes: Causes, fitted: Fit) -> None:
+        self.library, self.causes, self.windows = library, causes, fitted.windows
         self.values = fitted.values
         self.base, self.full = self.without(causes), library.extended(causes, self.values)
-        self.tangent = Tangent.of(self.full, windows, fitted)
+        self.tangent = Tangent.of(self.full, fitted)
         self.x, self.u = self.tangent.x, self.tangent.u
         self.places: dict[tuple[str, str], _Place] = {}
 

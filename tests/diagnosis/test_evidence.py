@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -155,7 +156,7 @@ def residuals(rho, n=40_000, seed=0):
 
 def seen(h, r):
     """A fit that leaves r (W, L, ny)."""
-    return Fit(h, np.empty(0), np.empty((len(r), 2)), r, 0.0, np.empty((0, 0)), np.ones_like(r), np.zeros((len(r), 2)))
+    return Fit(h, np.empty(0), np.empty((len(r), 2)), r, 0.0, np.empty((0, 0)), SimpleNamespace(weight=np.ones_like(r)))
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.5, 0.9])

@@ -61,9 +61,9 @@ def left(recording, period=PERIOD):
     model = equations({**SWING, "period": f"{period} s"})
     measured = Dataset.of(model, recording)
     library, windows = Library(model, measured, []), measured.windows(120)
-    last = rescued(fit(library.hypothesis(()), windows), windows)
+    last = rescued(fit(library.hypothesis(()), windows))
     extended = library.extended((), dict(zip(last.hypothesis.names, last.theta, strict=True)))
-    return leftover.left(extended, last, windows), last
+    return leftover.left(extended, last), last
 
 
 @pytest.mark.exam
@@ -158,11 +158,11 @@ def test_a_window_on_the_wrong_side_of_a_summit_is_led_back():
     windows = Dataset.of(model, recording).windows(120)
     off = replace(windows, start=windows.start + np.array([0.0, 6.0]))
     hypothesis = Library(model, windows.measured, []).hypothesis(())
-    lost = fit(hypothesis, off)
+    lost = replace(fit(hypothesis, off), windows=windows)
     assert np.mean(lost.residual**2) > 5
-    found = rescued(lost, windows)
+    found = rescued(lost)
     assert np.mean(found.residual**2) < 1.5
-    assert rescued(found, windows) is found
+    assert rescued(found) is found
 
 
 def test_causes_that_leave_something_are_doubted():
@@ -226,7 +226,7 @@ def test_what_swings_freely_may_lack_a_force_as_well():
     library = Library(model, Dataset.of(model, gc.Recording.of(t, {"q": y})), [])
     windows = library.measured.windows(120)
     last = fit(library.hypothesis(()), windows)
-    found = leftover.left(library.extended((), dict(zip(last.hypothesis.names, last.theta, strict=True))), last, windows)
+    found = leftover.left(library.extended((), dict(zip(last.hypothesis.names, last.theta, strict=True))), last)
     lacking = lack(found.long, found.short)
     assert lacking is not None
     assert lacking.site == "q"

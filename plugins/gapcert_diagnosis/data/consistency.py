@@ -10,7 +10,7 @@ from gapcert.plugin import Array, Model, Recording, StateSpec, Trajectory, Usage
 from gapcert_diagnosis.fitting.fit import Fit
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
-from .dataset import Dataset, Windows
+from .dataset import Dataset
 
 UNITS = {"ms": 1e3, "us": 1e6, "ns": 1e9, "min": 1 / 60, "h": 1 / 3600}  # how much too slow a motion is, if read in s
 
@@ -111,18 +111,18 @@ def _seen(model: Model, m: Dataset, s: StateSpec) -> Iterator[Array]:
         yield from (x[:, model.states.index(s)] for x in m.states)
 
 
-def lost(fitted: Fit, windows: Windows) -> bool:
+def lost(fitted: Fit) -> bool:
     """Does a fit whose windows begin where they like follow none of the channels?"""
-    m = windows.measured
+    m = fitted.windows.measured
     off = np.sqrt(fitted.chi) * m.sigma
     return bool((off > THRESHOLDS.lost_spread * m.spread).all() and fitted.chi.max() > THRESHOLDS.lost_floor)
 
 
-def doubt(fitted: Fit, windows: Windows) -> tuple[str, ...]:
+def doubt(fitted: Fit) -> tuple[str, ...]:
     """What is then taken for granted and is the likely reason, in words."""
-    if not lost(fitted, windows):
+    if not lost(fitted):
         return ()
-    m, seconds = windows.measured, windows.length * windows.measured.period
+    m, seconds = fitted.windows.measured, fitted.windows.length * fitted.windows.measured.period
     return (
         f"time, units and signs are as the spec says: samples are {m.period:.6g} s apart. The simulation follows nothing over "
         f"{seconds:.3g} s, even from a start of its own; look at recording.units (is the time in ms?), recording.columns, and "

@@ -26,10 +26,10 @@ TRIALS = np.array([0.1, 1.0, 10.0, 100.0])
 @final
 @dataclass(frozen=True)
 class Fit:
-    """The best numbers theta (p,) and starts (W, nx) of a hypothesis; residual (W, L, ny) in units of the noise floor.
+    """The best numbers theta (p,) and starts (W, nx) of a hypothesis on some windows.
 
-    covariance (p, p): of theta with the starts profiled out, per unit of residual variance. weight (W, L, ny): of the
-    samples, by which the residual is multiplied. place (W, 2): piece and first sample of the windows.
+    residual (W, L, ny): in units of the noise floor, times the weights of the windows. covariance (p, p): of theta with the
+    starts profiled out, per unit of residual variance.
     """
 
     hypothesis: Hypothesis
@@ -38,13 +38,12 @@ class Fit:
     residual: Array
     prior: float
     covariance: Array
-    weight: Array
-    place: Array
+    windows: Windows
 
     @cached_property
     def counts(self) -> Array:
         """Samples (ny,) that took part."""
-        return np.asarray(np.sum(self.weight**2, axis=(0, 1)))
+        return np.asarray(np.sum(self.windows.weight**2, axis=(0, 1)))
 
     @cached_property
     def chi(self) -> Array:
@@ -54,7 +53,7 @@ class Fit:
     @cached_property
     def whiteness(self) -> Array:
         """κ (ny,) = (1 − ρ₁)/(1 + ρ₁): the share of samples that count as independent, from the lag-1 autocorrelation."""
-        w = self.weight
+        w = self.windows.weight
         # Of as many neighbours as there would be without gaps.
         whole = self.counts * (w.shape[1] - 1) / w.shape[1]
         rho = lag_one(self.residual) * whole / np.maximum(np.sum((w[:, 1:] * w[:, :-1]) ** 2, axis=(0, 1)), 1)
@@ -63,7 +62,7 @@ class Fit:
     @cached_property
     def each(self) -> Array:
         """χ (W, ny) of every window; less than the noise floor counts as the floor."""
-        chi = np.sum(self.residual**2, axis=1) / np.maximum(np.sum(self.weight**2, axis=1), 1)
+        chi = np.sum(self.residual**2, axis=1) / np.maximum(np.sum(self.windows.weight**2, axis=1), 1)
         return np.asarray(np.maximum(chi, THRESHOLDS.counted_floor))
 
     @cached_property
@@ -127,7 +126,7 @@ def fit(
                 "recording.units: {TIME: ms}; otherwise look at the model's units and signs, the recording's columns, or give "
                 "a shorter diagnose.window"
             )
-    ends = _Ends.of(windows)
+    ends, given = _Ends.of(windows), windows
     here = _descended(h, windows, here, ends, iterations)
     for _ in range(THRESHOLDS.retraced_memories if h.model.remembers else 0):
         if (again := _retraced(h, windows, here)) is None:
@@ -138,10 +137,10 @@ def fit(
     schur = reduced(h, here, temper, np.zeros(1))[0][0]
     size = here.width[: len(theta)]
     covariance = np.asarray(np.linalg.pinv(schur) * np.outer(size, size))
-    return Fit(h, here.theta, here.start, here.residual, float(h.prior(here.theta)), covariance, windows.weight, windows.place)
+    return Fit(h, here.theta, here.start, here.residual, float(h.prior(here.theta)), covariance, given)
 
 
-def rescued(fitted: Fit, windows: Windows) -> Fit:
+def rescued(fitted: Fit) -> Fit:
     """The fit again from better starts of the windows that stand out, where that makes it better; else as it was.
 
     A start velocity that is off by the noise of a difference can lead a long window over an unstable equilibrium or around
@@ -151,6 +150,7 @@ def rescued(fitted: Fit, windows: Windows) -> Fit:
     lost = np.flatnonzero(energy > THRESHOLDS.lost_window * max(1.0, float(np.median(energy))))
     if not len(lost):
         return fitted
+    windows = fitted.windows
     some, fixed = windows.take(lost), fitted.hypothesis.holding(fitted.theta)
     start = some.start
     for part in THRESHOLDS.restart_parts:
@@ -176,7 +176,7 @@ def followed(h: Hypothesis, theta: Array, windows: Windows, start: Array | None 
     if _followable(r[rows]):
         return fit(fixed, windows, start=starts[rows])
     lost, none = np.full(r.shape[1:], THRESHOLDS.blown_residual), np.empty((0, 0))
-    return Fit(fixed, np.empty(0), windows.start, lost, 0.0, none, windows.weight, windows.place)
+    return Fit(fixed, np.empty(0), windows.start, lost, 0.0, none, windows)
 
 
 def carried(h: Hypothesis, theta: Array, other: Fit, windows: Windows, start: Array) -> Array:
@@ -184,7 +184,7 @@ def carried(h: Hypothesis, theta: Array, other: Fit, windows: Windows, start: Ar
 
     start: of a fit of these windows.
     """
-    known = dict(zip(map(tuple, other.place.tolist()), other.start, strict=True))
+    known = dict(zip(map(tuple, other.windows.place.tolist()), other.start, strict=True))
     rows = [known.get(tuple(place)) for place in windows.place.tolist()]
     new = np.array([row is None for row in rows])
     out = np.stack([own if row is None else row for row, own in zip(rows, start, strict=True)])
@@ -193,12 +193,12 @@ def carried(h: Hypothesis, theta: Array, other: Fit, windows: Windows, start: Ar
     return out
 
 
-def stepped(fitted: Fit, windows: Windows, others: Sequence[Hypothesis]) -> list[Fit | None]:
-    """Other simulations with the numbers of a fit on these windows, each one Gauss–Newton step from it; None: not finite.
+def stepped(fitted: Fit, others: Sequence[Hypothesis]) -> list[Fit | None]:
+    """Other simulations with the numbers of a fit on its windows, each one Gauss–Newton step from it; None: not finite.
 
     The slopes are those of the fit, which is all that many simulations cost that differ little from its own.
     """
-    h, theta, start = fitted.hypothesis, fitted.theta, fitted.start
+    h, theta, start, windows = fitted.hypothesis, fitted.theta, fitted.start, fitted.windows
     thetas, starts, width = nearby(h, theta, start, _linearise(h, windows, theta, start).near(h))
     r = _residual(h, windows, thetas, starts)
     moved, n, out = r[1:] - r[0], max(1.0, float(np.count_nonzero(windows.weight))), list[Fit | None]()
@@ -211,7 +211,7 @@ def stepped(fitted: Fit, windows: Windows, others: Sequence[Hypothesis]) -> list
         cost = squares(trials) + temper * other.prior(theta + moves)
         k = int(np.argmin(np.where(np.isfinite(cost), cost, np.inf)))
         ends = theta + moves[k], start + shifts[k], trials[k]
-        known = Fit(other, *ends, float(other.prior(ends[0])), fitted.covariance, windows.weight, windows.place)
+        known = Fit(other, *ends, float(other.prior(ends[0])), fitted.covariance, windows)
         out.append(known if np.isfinite(cost[k]) else None)
     return out
 
@@ -324,9 +324,9 @@ def promising(h: Hypothesis, windows: Windows, thetas: Array, start: Array) -> t
     return best
 
 
-def slopes(fitted: Fit, windows: Windows) -> Array:
+def slopes(fitted: Fit) -> Array:
     """What moving each number of a fit by a step adds to the residual, (W, L·ny, p); 0 where that is not finite."""
-    h, p = fitted.hypothesis, len(fitted.theta)
+    h, p, windows = fitted.hypothesis, len(fitted.theta), fitted.windows
     step = _linearise(h, windows, fitted.theta, fitted.start).near(h)
     thetas, starts, _ = nearby(h, fitted.theta, fitted.start, step)
     r = _residual(h, windows, thetas[: 1 + p], starts[: 1 + p])

@@ -241,9 +241,9 @@ class Tangent:
     _made: dict[object, Array] = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
-    def of(cls, model: Model, windows: Windows, fitted: Fit) -> Tangent:
-        """model: linearised where the path of the fit on these windows lies."""
-        m, nx = windows.measured, model.nx
+    def of(cls, model: Model, fitted: Fit) -> Tangent:
+        """model: linearised where the path of the fit lies."""
+        windows, m, nx = fitted.windows, fitted.windows.measured, model.nx
         x = fitted.hypothesis.motion(windows, fitted.theta[None], fitted.start[None])
         u = windows.drive[:, m.past :][:, : x.shape[1]]
         at = flat(x[:, :: m.repeat]), flat(u[:, :: m.repeat])

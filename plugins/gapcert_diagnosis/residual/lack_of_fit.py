@@ -186,7 +186,7 @@ def _rare(total: float, k: float) -> float:
 
 def _absorbed(motion: Tangent) -> Array:
     """An orthonormal basis (W·L·ny, k) of what the fitted numbers make, with the starts free to follow."""
-    rows = motion.project(slopes(motion.fitted, motion.windows)).reshape(motion.residual.size, -1)
+    rows = motion.project(slopes(motion.fitted)).reshape(motion.residual.size, -1)
     if not rows.shape[1]:
         return rows
     u, size, _ = np.linalg.svd(rows / (np.linalg.norm(rows, axis=0) + 1e-300), full_matrices=False)

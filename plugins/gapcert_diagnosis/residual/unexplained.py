@@ -16,7 +16,6 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from gapcert.plugin import Array, Model
-from gapcert_diagnosis.data.dataset import Windows
 from gapcert_diagnosis.fitting.fit import Fit, fit, lag_one, rescued
 from gapcert_diagnosis.fitting.linearised import Tangent
 from gapcert_diagnosis.results import Push, Unexplained, Verdict
@@ -64,12 +63,12 @@ class Left:
         return self.coherent and self.share > THRESHOLDS.slight_force
 
 
-def left(model: Model, last: Fit, windows: Windows, seed: int = 0) -> Left:
+def left(model: Model, last: Fit, seed: int = 0) -> Left:
     """What the final fit leaves; model: with the causes at their fitted numbers, for slopes and for the force of the effort."""
-    last, m = rescued(last, windows), windows.measured
-    brief = m.windows(min(m.brief(THRESHOLDS.short_window), windows.length))
-    again = rescued(fit(last.hypothesis, brief, theta=last.theta, iterations=5), brief)
-    long, short = Tangent.of(model, windows, last), Tangent.of(model, brief, again)
+    last, m = rescued(last), last.windows.measured
+    brief = m.windows(min(m.brief(THRESHOLDS.short_window), last.windows.length))
+    again = rescued(fit(last.hypothesis, brief, theta=last.theta, iterations=5))
+    long, short = Tangent.of(model, last), Tangent.of(model, again)
     found = _judged(long, short, seed)
     if found.remains and m.rough.any():
         smooth = _judged(_smoothed(long), _smoothed(short), seed)
@@ -162,7 +161,7 @@ def unexplained(found: Left) -> Unexplained:
     windows, short = found.short.windows, found.short.fitted
     overlapping = windows.measured.windows(windows.length, max(1, windows.length // 2))
     again = fit(short.hypothesis.holding(short.theta), overlapping)
-    motion = Tangent.of(found.short.model, overlapping, again)
+    motion = Tangent.of(found.short.model, again)
     events = _single(_pushes(motion, motion.model.sites("coordinate")))
     return Unexplained(False, events if _quiet(motion, events) else (), kinds, where)
 

@@ -176,7 +176,7 @@ class _Settings:
         base = self.fitted(self.library.model, causes, self.few, start)
         under = [(v, self.bare(v.model).hypothesis(causes)) for v in variants]
         alike = [(v, h) for v, h in under if h.names == base.hypothesis.names]
-        own, *fits = stepped(base, self.few, [base.hypothesis, *(h for _, h in alike)])
+        own, *fits = stepped(base, [base.hypothesis, *(h for _, h in alike)])
         found = [(v, f, own or base) for (v, _), f in zip(alike, fits, strict=True) if f is not None]
         # A setting that takes numbers away, or brings some, has no slopes in common.
         others = [self.fit_under(v, causes, start) for v, h in under if h.names != base.hypothesis.names]

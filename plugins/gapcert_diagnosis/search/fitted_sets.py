@@ -45,7 +45,7 @@ class FittedSets:
         self.cautious = False
         self.lost: set[Keys] = set()
         self.negligible: dict[tuple[str, str], float] = {}
-        self.nothing = self.fit((), None) if plain is None else self._keep((), rescued(plain, windows))
+        self.nothing = self.fit((), None) if plain is None else self._keep((), rescued(plain))
 
     @cached_property
     def screen(self) -> Screen:
@@ -82,7 +82,7 @@ class FittedSets:
         fewer = base is not None and keys(causes) < keys(base[0]) and len(base[1].start) == len(self.windows)
         theta = h.theta({**known, **(start or {})})
         new = fit(h, self.windows, theta=theta, start=base[1].start if base and fewer else None)
-        return self._keep(causes, rescued(new, self.windows))
+        return self._keep(causes, rescued(new))
 
     def fit_from(self, causes: Causes, other: Fit) -> Fit:
         """The fit of a set from its numbers on other windows; starts that are not known from there follow these first."""
@@ -91,7 +91,7 @@ class FittedSets:
             theta = h.theta(other.values)
             closest = min((f for _, f in self._fits.values()), key=lambda f: float(f.chi.sum()))
             start = carried(h, theta, other, self.windows, closest.start)
-            self._keep(causes, rescued(fit(h, self.windows, theta=theta, start=start), self.windows))
+            self._keep(causes, rescued(fit(h, self.windows, theta=theta, start=start)))
         return self._fits[keys(causes)][1]
 
     def _keep(self, causes: Causes, new: Fit) -> Fit:
