@@ -137,22 +137,23 @@ def _rows(out: Array) -> Array:
 class Path:
     """The measured motion of windows at every model step, history first: x (W, P + S, nx), u (W, P + S, nu)."""
 
-    def __init__(self, windows: Windows, guess: Fit) -> None:
+    def __init__(self, windows: Windows, guess: Fit, start: Array) -> None:
+        """start (W, nx): of these windows, as the guess has them."""
         m, repeat = windows.measured, windows.measured.repeat
         self.windows, self.lead = windows, m.past
         steps = self.lead + (windows.length - 1) * repeat
         self.u = windows.drive[:, :steps]
         samples = np.stack([m.states[i][s - m.history : s + windows.length] for i, s in windows.place.tolist()])
-        self._fill(samples, guess)
+        self._fill(samples, guess, start)
         share = np.arange(repeat) / repeat
         between = samples[:, :-1, None] + share[:, None] * np.diff(samples, axis=1)[:, :, None]
         self.x, self.samples = between.reshape(len(windows), steps, -1), samples
 
-    def _fill(self, samples: Array, guess: Fit) -> None:
+    def _fill(self, samples: Array, guess: Fit, start: Array) -> None:
         """States that no channel shows are those of the fit."""
         blind, history = ~np.any(samples, axis=(0, 1)), self.windows.measured.history
         if blind.any():
-            motion = guess.hypothesis.motion(self.windows, guess.theta[None], guess.start[None])
+            motion = guess.hypothesis.motion(self.windows, guess.theta[None], start[None])
             found = np.nan_to_num(motion[:, :: max(1, motion.shape[1] // self.windows.length)][:, : self.windows.length])
             samples[:, history:, blind] = found[..., blind]
             samples[:, :history, blind] = found[:, :1, blind]

@@ -45,7 +45,7 @@ class FittedSets:
         self.cautious = False
         self.lost: set[Keys] = set()
         self.negligible: dict[tuple[str, str], float] = {}
-        self.nothing = self.fit((), None) if plain is None else self._keep((), rescued(plain))
+        self.nothing = self.fit((), None) if plain is None else self._keep((), plain)
 
     @cached_property
     def screen(self) -> Screen:
@@ -81,8 +81,7 @@ class FittedSets:
             start = self._first(causes, base)
         fewer = base is not None and keys(causes) < keys(base[0]) and len(base[1].start) == len(self.windows)
         theta = h.theta({**known, **(start or {})})
-        new = fit(h, self.windows, theta=theta, start=base[1].start if base and fewer else None)
-        return self._keep(causes, rescued(new))
+        return self._keep(causes, fit(h, self.windows, theta=theta, start=base[1].start if base and fewer else None))
 
     def fit_from(self, causes: Causes, other: Fit) -> Fit:
         """The fit of a set from its numbers on other windows; starts that are not known from there follow these first."""
@@ -91,11 +90,12 @@ class FittedSets:
             theta = h.theta(other.values)
             closest = min((f for _, f in self._fits.values()), key=lambda f: float(f.chi.sum()))
             start = carried(h, theta, other, self.windows, closest.start)
-            self._keep(causes, rescued(fit(h, self.windows, theta=theta, start=start)))
+            self._keep(causes, fit(h, self.windows, theta=theta, start=start))
         return self._fits[keys(causes)][1]
 
-    def _keep(self, causes: Causes, new: Fit) -> Fit:
-        old = self.known(causes)
+    def _keep(self, causes: Causes, made: Fit) -> Fit:
+        """The better one of what was known, and of this once its lost windows are led back."""
+        new, old = rescued(made), self.known(causes)
         if old is None or self.better(new, old) > 0:
             self._fits[keys(causes)] = causes, new
         return self._fits[keys(causes)][1]

@@ -11,7 +11,6 @@ import functools
 import itertools
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any, final
 
 import numpy as np
@@ -39,7 +38,7 @@ class Screen:
         if len(rows) > few:
             rows = np.unique(np.linspace(0, len(windows) - 1, few).astype(int))
         self.library, self.rows, self.windows = library, rows, windows.take(rows)
-        self.path = Path(self.windows, replace(guess, start=guess.start[rows]))
+        self.path = Path(self.windows, guess, guess.start[rows])
         self._pushes: dict[tuple[str, str], Push] = {}
         self._made: dict[object, Any] = {}
 
