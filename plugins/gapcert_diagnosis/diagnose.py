@@ -131,8 +131,9 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
 
     answer = answered(settled.search, settled.found, data.windows)
     if settled.settings:
-        answer = replace(answer, plain=fit(data.library.hypothesis(()), answer.windows))
-    judges = data.stretches(problem.horizons, answer)
+        answer = replace(answer, plain=fit(data.library.hypothesis(()), answer.fit.windows))
+    # As the answer holds the inputs, and as its fit finds starts best.
+    judges = stretches(replace(data.held, hold=answer.dataset.hold), problem.horizons, answer.fit)
     judge, settings = judges[-1], settled.settings
     answer = _largest_first(answer, judge)
     named = tuple(_set(answer, s, judge) for s in settings) + tuple(_named(answer, c, judge) for c in answer.causes)
@@ -198,20 +199,10 @@ class _Data:
         held = replace(Dataset.of(model, with_past), sigma=fitted.sigma, spread=fitted.spread, since=since)
         _warned(problem.clock.emit, fitted, held)
         assumed = kept_within(model, fitted, held)
-        data = cls(
-            library,
-            fitted.windows(_length(fitted, model, problem.window)).thinned(THRESHOLDS.fitted_values, THRESHOLDS.guard_windows),
-            held,
-            assumed,
-        )
-        data.stretches(problem.horizons)  # refuses before the search is paid for
-        return data
-
-    def stretches(self, horizons: Sequence[float], answer: Answer | None = None) -> tuple[Stretches, ...]:
-        """What is held out, one per horizon; as an answer holds the inputs, and as its fit finds starts best."""
-        if answer is None:
-            return stretches(self.held, horizons)
-        return stretches(replace(self.held, hold=answer.dataset.hold), horizons, answer.dataset, answer.fit)
+        windows = fitted.windows(_length(fitted, model, problem.window))
+        windows = windows.thinned(THRESHOLDS.fitted_values, THRESHOLDS.guard_windows)
+        stretches(held, problem.horizons)  # refuses before the search is paid for
+        return cls(library, windows, held, assumed)
 
 
 def _warned(emit: Emit, fitted: Dataset, held: Dataset) -> None:
@@ -297,13 +288,13 @@ def _named(answer: Answer, c: Candidate, judge: Stretches) -> Cause:
 def _set(answer: Answer, s: Setting, judge: Stretches) -> Cause:
     """A setting of the engine: what it explains beside all other causes, refitted without it."""
     h = Library(s.before.model, s.before.measured, []).hypothesis(answer.causes)
-    before = judge.error(fit(h, answer.windows, theta=h.theta(answer.fit.values)))
+    before = judge.error(fit(h, answer.fit.windows, theta=h.theta(answer.fit.values)))
     v, numbers = s.variant, dict[str, Estimate]()
     if isinstance(v.value, int | float) and not isinstance(v.value, bool):
         numbers["value"] = Estimate.of(float(v.value))
     rival = None
     if s.runner_up is not None:
-        other = fit(Library(s.runner_up.model, s.before.measured, []).hypothesis(()), answer.windows)
+        other = fit(Library(s.runner_up.model, s.before.measured, []).hypothesis(()), answer.fit.windows)
         rival = Rival("engine-setting", s.runner_up.setting, _share(judge.error(other), before), s.margin, judge.rms(other))
     share = _share(judge.error(answer.fit), before)
     changed = {"value": v.value, "was": v.was}

@@ -86,24 +86,22 @@ class Stretches:
         return {c.name: Gain(*map(float, columns[:, i])) for i, c in enumerate(w.measured.channels)}
 
 
-def stretches(
-    held: Dataset, horizons: Sequence[float], seen: Dataset | None = None, fitted: Fit | None = None
-) -> tuple[Stretches, ...]:
+def stretches(held: Dataset, horizons: Sequence[float], fitted: Fit | None = None) -> tuple[Stretches, ...]:
     """One per horizon, shortest first.
 
-    A short lead leaves the start to noise, a long one to what the model lacks: where data that were fitted are given, the lead
-    is the one with the least error there.
+    A short lead leaves the start to noise, a long one to what the model lacks: where a fit is given, the lead is the one with
+    the least error on the data that it was made to.
     """
-    return tuple(Stretches.of(held, h, _lead(seen, h, fitted)) for h in sorted(horizons))
+    return tuple(Stretches.of(held, h, _lead(h, fitted)) for h in sorted(horizons))
 
 
-def _lead(seen: Dataset | None, horizon: float, fitted: Fit | None) -> float:
-    if seen is None or fitted is None:
+def _lead(horizon: float, fitted: Fit | None) -> float:
+    if fitted is None:
         return THRESHOLDS.rollout_leads[-1]
     leads = {}
     for lead in THRESHOLDS.rollout_leads:
         try:
-            leads[lead] = Stretches.of(seen, horizon, lead).error(fitted)
+            leads[lead] = Stretches.of(fitted.windows.measured, horizon, lead).error(fitted)
         except UsageError:
             break  # too little was fitted for so long a horizon; what is held out may be longer
     return min(leads, key=lambda k: leads[k]) if leads else THRESHOLDS.rollout_leads[-1]

@@ -42,13 +42,9 @@ class Answer:
         return self.search.library
 
     @property
-    def windows(self) -> Windows:
-        return self.search.windows
-
-    @property
     def dataset(self) -> Dataset:
         """Of the windows, with the input held as fits best."""
-        return self.search.windows.measured
+        return self.fit.windows.measured
 
     @property
     def nothing(self) -> Fit:
