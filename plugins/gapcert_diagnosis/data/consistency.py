@@ -111,18 +111,12 @@ def _seen(model: Model, m: Dataset, s: StateSpec) -> Iterator[Array]:
         yield from (x[:, model.states.index(s)] for x in m.states)
 
 
-def lost(fitted: Fit) -> bool:
-    """Does a fit whose windows begin where they like follow none of the channels?"""
-    m = fitted.windows.measured
-    off = np.sqrt(fitted.chi) * m.sigma
-    return bool((off > THRESHOLDS.lost_spread * m.spread).all() and fitted.chi.max() > THRESHOLDS.lost_floor)
-
-
 def doubt(fitted: Fit) -> tuple[str, ...]:
-    """What is then taken for granted and is the likely reason, in words."""
-    if not lost(fitted):
-        return ()
+    """What is taken for granted, in words, where a fit whose windows begin where they like follows none of the channels."""
     m, seconds = fitted.windows.measured, fitted.windows.length * fitted.windows.measured.period
+    off = np.sqrt(fitted.chi) * m.sigma
+    if not ((off > THRESHOLDS.lost_spread * m.spread).all() and fitted.chi.max() > THRESHOLDS.lost_floor):
+        return ()
     return (
         f"time, units and signs are as the spec says: samples are {m.period:.6g} s apart. The simulation follows nothing over "
         f"{seconds:.3g} s, even from a start of its own; look at recording.units (is the time in ms?), recording.columns, and "
