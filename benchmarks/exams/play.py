@@ -18,7 +18,7 @@ from exams.hidden.rig import Rig, rig
 from exams.hidden.truth import Truth
 from exams.sit import Record
 from gapcert_diagnosis.data.dataset import Dataset
-from gapcert_diagnosis.experiment.design import Limits
+from gapcert_diagnosis.experiment import Limits
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 FIXED = ("multisine", "steps", "chirp")

@@ -8,8 +8,7 @@ from gapcert.plugin import LazyPackage, homes
 
 _HOME = homes(
     {
-        "gapcert_diagnosis.diagnose": "diagnose",
-        "gapcert_diagnosis.problem": "Diagnoser DiagnosisProblem",
+        "gapcert_diagnosis.diagnose": "Diagnoser DiagnosisProblem diagnose",
         "gapcert_diagnosis.results": "ORDER Cause Diagnosis Estimate Gain",
         "gapcert_diagnosis.testing": "EffectContract",
     }

@@ -1,6 +1,6 @@
+from gapcert_diagnosis.diagnose import Diagnoser as Diagnoser
+from gapcert_diagnosis.diagnose import DiagnosisProblem as DiagnosisProblem
 from gapcert_diagnosis.diagnose import diagnose as diagnose
-from gapcert_diagnosis.problem import Diagnoser as Diagnoser
-from gapcert_diagnosis.problem import DiagnosisProblem as DiagnosisProblem
 from gapcert_diagnosis.results import ORDER as ORDER
 from gapcert_diagnosis.results import Cause as Cause
 from gapcert_diagnosis.results import Diagnosis as Diagnosis

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import time
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,25 +12,22 @@ from typing import Any, Literal, final
 
 import numpy as np
 
-from gapcert.plugin import Effect, Emit, Event, Model, Recording, UsageError, registry, silent
+from gapcert.plugin import BEAT, Effect, Emit, Event, Model, Recording, UsageError, registry, silent
 from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_recordings import JITTER, repairs
 
-from .data import time_units as clocks
+from .data.consistency import agreeing, doubt, kept_within, ordered
 from .data.dataset import Dataset, Windows
-from .data.joint_limits import kept_within
-from .experiment.design import Limits, told_apart
+from .experiment import Limits, told_apart
 from .figure import figure
 from .fitting.fit import Fit, fit
 from .fitting.rollout_error import Stretches, stretches
 from .fitting.step_size import coarse
-from .problem import Clock, DiagnosisProblem
 from .residual import unexplained as leftover
-from .residual.tests import evidence
 from .results import Cause, Diagnosis, Estimate, Misfit, Rival
 from .search.alternatives import Answer, answered, flags, smallest
-from .search.candidates import Candidate, Causes, Library
-from .search.criterion import keys, values
+from .search.candidates import Candidate, Library
+from .search.criterion import keys, without
 from .search.engine_settings import Setting, across
 
 
@@ -64,6 +63,64 @@ def diagnose(
     return replace(answer(problem), timings=clock.laps)
 
 
+@final
+@dataclass(frozen=True)
+class DiagnosisProblem:
+    """Why does a model differ from a recording? The arguments of `diagnose`, with defaults made and effects built.
+
+    fitted, held_out: the parts of the recording. clock: times the parts of the work, and tells its progress.
+    """
+
+    model: Model
+    recording: Recording
+    fitted: Recording
+    held_out: Recording
+    effects: Sequence[Effect]
+    horizons: Sequence[float]
+    window: float | None
+    experiment: Mapping[str, Any]
+    seed: int
+    folder: Path | None
+    clock: Clock
+
+
+class Diagnoser(ABC):
+    """A component of kind `diagnoser`: another way to a diagnosis, for models that no search with equations suits."""
+
+    @abstractmethod
+    def accepts(self, model: Model) -> bool:
+        """Is it for this model? The first that accepts one, by name, answers; the search with equations where none does."""
+
+    @abstractmethod
+    def diagnose(self, problem: DiagnosisProblem) -> Diagnosis:
+        """The answer, without its timings: these are the laps of the problem's clock."""
+
+
+@final
+class Clock:
+    """Wall time per part in s, and progress for observers."""
+
+    def __init__(self, emit: Emit) -> None:
+        self.emit, self.count, self.last, self.told = emit, 0, time.perf_counter(), 0.0
+        self.laps: dict[str, float] = {}
+        self.best: Mapping[str, Any] = {}
+
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self.laps[name], self.last = round(now - self.last, 3), now
+
+    def tell(self, text: str, best: Mapping[str, Any] | None = None, *, fitted: bool = True) -> None:
+        """What is tried next: a hypothesis that is fitted, or one of many that are only screened, of which few are told."""
+        now = time.perf_counter()
+        self.count += fitted
+        if fitted or now - self.told > BEAT:
+            self.told = now
+            # A search that begins anew, on other windows, has no best of its own yet.
+            self.best = best or self.best
+            more = {"best": self.best} if self.best else {}
+            self.emit(Event("progress", "diagnosis", {"done": self.count, "unit": "hypotheses", "text": text, **more}))
+
+
 def _searched(problem: DiagnosisProblem) -> Diagnosis:
     """With equations: effects are added to them, and what does not pay is dropped."""
     data, lap, seed = _Data.of(problem), problem.clock.lap, problem.seed
@@ -74,8 +131,9 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
 
     answer = answered(settled.search, settled.found, data.windows)
     if settled.settings:
-        answer = replace(answer, plain=fit(data.library.hypothesis(()), answer.windows))
-    judges = data.stretches(problem.horizons, answer)
+        answer = replace(answer, plain=fit(data.library.hypothesis(()), answer.fit.windows))
+    # As the answer holds the inputs, and as its fit finds starts best.
+    judges = stretches(replace(data.held, hold=answer.dataset.hold), problem.horizons, answer.fit)
     judge, settings = judges[-1], settled.settings
     answer = _largest_first(answer, judge)
     named = tuple(_set(answer, s, judge) for s in settings) + tuple(_named(answer, c, judge) for c in answer.causes)
@@ -88,9 +146,9 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
     limits = Limits.of(data.library.model, dataset, asked.get("limits"), asked.get("seconds", 12.0))
     design = told_apart(answer.causes, answer.fit, answer.ties, dataset, limits, seed)[0]
     lap("experiment")
-    left = leftover.left(data.library.extended(answer.causes, values(answer.fit)), answer.fit, answer.windows, seed)
-    doubt = clocks.doubt(answer.fit, answer.windows)
-    verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, design is not None, bool(doubt))
+    left = leftover.left(data.library.extended(answer.causes, answer.fit.values), answer.fit, seed)
+    doubted = doubt(answer.fit)
+    verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, design is not None, bool(doubted))
     lap("leftover")
     ties = [tuple(c.key for c in tie) for tie, _ in answer.ties]
     ties += [(("engine-setting", s.runner_up.setting),) for s in settings if s.runner_up and s.margin < THRESHOLDS.tie_score]
@@ -107,14 +165,14 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
         rest,
         figure(answer.search, answer.causes, answer.fit, judge, design, rest.correction if rest else None, plain),
         design=design,
-        evidence=evidence(left),
+        evidence=leftover.evidence(left),
         negligible=tuple((*k, s) for k, s in answer.negligible.items() if k not in keys(answer.causes)),
         smallest=smallest(answer.search) if verdict == "nothing" else (),
         log={**dataset.log, "hold": dataset.hold or "undeclared"},
-        assumptions=(*data.assumptions, *doubt),
+        assumptions=(*data.assumptions, *doubted),
         # How long the experiments were, of which none tells the ties apart.
         seconds=limits.seconds if answer.ties and limits.inputs and not design else None,
-        warnings=coarse(answer.fit, answer.windows),
+        warnings=coarse(answer.fit),
         refitted=_refitted(answer),
     )
 
@@ -141,20 +199,10 @@ class _Data:
         held = replace(Dataset.of(model, with_past), sigma=fitted.sigma, spread=fitted.spread, since=since)
         _warned(problem.clock.emit, fitted, held)
         assumed = kept_within(model, fitted, held)
-        data = cls(
-            library,
-            fitted.windows(_length(fitted, model, problem.window)).thinned(THRESHOLDS.fitted_values, THRESHOLDS.guard_windows),
-            held,
-            assumed,
-        )
-        data.stretches(problem.horizons)  # refuses before the search is paid for
-        return data
-
-    def stretches(self, horizons: Sequence[float], answer: Answer | None = None) -> tuple[Stretches, ...]:
-        """What is held out, one per horizon; as an answer holds the inputs, and as its fit finds starts best."""
-        if answer is None:
-            return stretches(self.held, horizons)
-        return stretches(self.held.with_hold(answer.dataset.hold), horizons, answer.dataset, answer.fit)
+        windows = fitted.windows(_length(fitted, model, problem.window))
+        windows = windows.thinned(THRESHOLDS.fitted_values, THRESHOLDS.guard_windows)
+        stretches(held, problem.horizons)  # refuses before the search is paid for
+        return cls(library, windows, held, assumed)
 
 
 def _warned(emit: Emit, fitted: Dataset, held: Dataset) -> None:
@@ -168,12 +216,12 @@ def _warned(emit: Emit, fitted: Dataset, held: Dataset) -> None:
 
 def _largest_first(answer: Answer, judge: Stretches) -> Answer:
     """Causes by the held-out error that each of them missing would leave: the order of finding is the search's own affair."""
+    return replace(answer, causes=tuple(sorted(answer.causes, key=lambda c: _missing(answer, c, judge), reverse=True)))
 
-    def left(c: Candidate) -> float:
-        rest = tuple(k for k in answer.causes if k is not c)
-        return judge.error(answer.search.fit(rest, (answer.causes, answer.fit)))
 
-    return replace(answer, causes=tuple(sorted(answer.causes, key=left, reverse=True)))
+def _missing(answer: Answer, c: Candidate, judge: Stretches) -> float:
+    """The held-out error with all causes but one."""
+    return judge.error(answer.search.fit(without(answer.causes, (c,)), (answer.causes, answer.fit)))
 
 
 def _refitted(answer: Answer) -> dict[str, dict[str, Any]]:
@@ -195,15 +243,17 @@ def _effects(effects: Sequence[Effect | str] | Literal["all"]) -> list[Effect]:
 
 def _timed(model: Model, recording: Recording, horizons: Sequence[float]) -> None:
     """Refuses rows in no order, and what is shorter than a sample: as a rule times in another unit than they are read in."""
-    clocks.ordered(recording)
-    period, shortest = recording.period, min(horizons, default=math.inf)
+    ordered(recording)
+    if not horizons:
+        raise UsageError("diagnose: no horizon is given; name at least one in seconds, such as [0.5]")
+    period, shortest = recording.period, min(horizons)
     if 0 < shortest < (1 - JITTER) * period:
         raise UsageError(
             f"diagnose.horizons: {shortest:g} s is shorter than {period:.6g} s, the period of the recording; expected at least "
             "that; is its time in s? Give the unit of that column otherwise, recording.units: {TIME: ms}, or longer horizons",
             ("diagnose", "horizons"),
         )
-    clocks.agreeing(model, recording)
+    agreeing(model, recording)
 
 
 def _length(measured: Dataset, model: Model, window: float | None) -> int:
@@ -223,12 +273,10 @@ def _length(measured: Dataset, model: Model, window: float | None) -> int:
 
 def _named(answer: Answer, c: Candidate, judge: Stretches) -> Cause:
     """A cause with its numbers, its share, its runner-up, and what speaks against it."""
-    library, last = answer.library, answer.fit
-    rest = tuple(k for k in answer.causes if k is not c)
-    before = judge.error(answer.search.fit(rest, (answer.causes, last)))
+    library, last, before = answer.library, answer.fit, _missing(answer, c, judge)
     runner_up = None
     for rival, fitted in answer.rivals[c.key][:1]:
-        other = next(k for k in rival if k.key not in {r.key for r in rest})
+        other = without(rival, without(answer.causes, (c,)))[0]
         runner_up = Rival(
             *other.key, _share(judge.error(fitted), before), answer.search.better(last, fitted), judge.rms(fitted)
         )
@@ -240,14 +288,13 @@ def _named(answer: Answer, c: Candidate, judge: Stretches) -> Cause:
 def _set(answer: Answer, s: Setting, judge: Stretches) -> Cause:
     """A setting of the engine: what it explains beside all other causes, refitted without it."""
     h = Library(s.before.model, s.before.measured, []).hypothesis(answer.causes)
-    known = dict(zip(h.names, h.value.tolist(), strict=True)) | values(answer.fit)
-    before = judge.error(fit(h, answer.windows, theta=np.array([known[n] for n in h.names])))
+    before = judge.error(fit(h, answer.fit.windows, theta=h.theta(answer.fit.values)))
     v, numbers = s.variant, dict[str, Estimate]()
     if isinstance(v.value, int | float) and not isinstance(v.value, bool):
         numbers["value"] = Estimate.of(float(v.value))
     rival = None
     if s.runner_up is not None:
-        other = fit(Library(s.runner_up.model, s.before.measured, []).hypothesis(()), answer.windows)
+        other = fit(Library(s.runner_up.model, s.before.measured, []).hypothesis(()), answer.fit.windows)
         rival = Rival("engine-setting", s.runner_up.setting, _share(judge.error(other), before), s.margin, judge.rms(other))
     share = _share(judge.error(answer.fit), before)
     changed = {"value": v.value, "was": v.was}
@@ -261,15 +308,13 @@ def _read(answer: Answer, c: Candidate, numbers: Mapping[str, float], judge: Str
     before = judge.error(answer.fit) ** 2
     # All of the noise floor, where the rounding is most of it.
     left = max(0.0, before - m.sigma[channel] ** 2 / m.spread[channel] ** 2 / len(m.channels))
-    known = {
-        p.name: Estimate.of(numbers[n], unit=unit)
-        for p, n, unit in zip(c.effect.parameters, library.names(c), library.units(c), strict=True)
-    }
+    rows = zip(library.parameters(c).items(), library.units(c), strict=True)
+    known = {p.name: Estimate.of(numbers[n], unit=unit) for (n, p), unit in rows}
     return Cause(*c.key, known, _share(math.sqrt(left), math.sqrt(before)))
 
 
 def _extended(answer: Answer) -> Model:
-    library, numbers = answer.library, values(answer.fit)
+    library, numbers = answer.library, answer.fit.values
     for _, found in library.seen:
         numbers |= found
     return library.extended((*answer.causes, *(c for c, _ in library.seen)), numbers)
@@ -295,12 +340,8 @@ def _misfits(answer: Answer) -> dict[str, Misfit]:
 def _experiment(answer: Answer) -> str | None:
     """What would tell the first tie apart."""
     for tie, _ in answer.ties:
-        a, b = _without(answer.causes, tie)[0], _without(tie, answer.causes)[0]
+        a, b = without(answer.causes, tie)[0], without(tie, answer.causes)[0]
         known = a.effect.rivals.get(b.effect.name) or b.effect.rivals.get(a.effect.name)
         text = known or f"{a.effect.experiment}; {b.effect.experiment}"
         return f"to tell {a.effect.name} at {a.site} from {b.effect.name} at {b.site}: {text}"
     return None
-
-
-def _without(causes: Causes, others: Causes) -> Causes:
-    return tuple(c for c in causes if c.key not in {k.key for k in others})

@@ -36,50 +36,48 @@ if TYPE_CHECKING:
 
 @final
 class DiagnosisStudy(Study):
-    def run(self, build: Build, folder: Path, stages: Stages, made: Outcome) -> Outcome:
-        return answer(replace(build, hidden_later=True), build.spec.config.sections["diagnose"], folder, stages)
-
-
-def answer(build: Build, asked: DiagnoseConfig, folder: Path, stages: Stages) -> Outcome:
     """The second question: causes, extended model, gain; and γ before and after, where a backend and a domain are given."""
-    c = build.spec.config
-    with stages.stage("recording"):
-        # A model without a period of its own has the recording's, which can be read without the model's units.
-        left_out = getattr(c.model, "period", 1) is None
-        model: Model = build.make("model", period=_period(build) if left_out else None)
-        close, parts = _closer(build, model)
-        seen: Model = close.make("model") if parts > 1 else model
-        recording = _played(close, seen) if c.reality is not None else build.make("recording", model).read()
-        # A backend, a domain or a goal that does not fit is refused here, before the diagnosis is paid for.
-        asks = c.backend is not None or (c.reality is not None and c.certificate is not None)
-        against = build.against(model) if asks and c.domain is not None else None
-        if against is not None and c.controller is not None:
-            build.make("controller").check(model, against[1], build.spec.goal(against[1]))
-    with stages.stage("diagnosis"):
-        hold_out = asked.hold_out.model_dump(exclude_none=True, by_alias=True)
-        found = diagnose(
-            seen,
-            recording,
-            asked.effects,
-            hold_out=hold_out,
-            train=None if asked.train is None else asked.train.model_dump(exclude_none=True),
-            horizons=tuple(asked.horizons),
-            window=asked.window,
-            experiment=None if asked.experiment is None else asked.experiment.model_dump(),
-            seed=c.seed,
-            emit=stages.emit,
-            folder=folder,
-        )
-    if parts > 1:
-        found = replace(found, extended_model=_paced(found.extended_model, 1 / parts))
-    stages.finished("diagnosis", diagnosis=found, recording=recording, bodies=(seen, *(against or ())[:1]))
-    summary: dict[str, Any] = {"sentence": found.sentence(), **found.summary()}
-    stages.timings |= {k: v for k, v in summary.pop("timings").items() if k not in stages.timings}
-    summary |= left_behind(c.name, found, folder)
-    certificate = None
-    if against is not None:
-        summary["recertified"], certificate = _recertify(build, stages, *against, model, found, folder)
-    return Outcome(summary, {"diagnosis": found, "certificate": certificate})
+
+    def run(self, build: Build, folder: Path, stages: Stages, made: Outcome) -> Outcome:
+        build, c = replace(build, hidden_later=True), build.spec.config
+        asked: DiagnoseConfig = c.sections["diagnose"]
+        with stages.stage("recording"):
+            # A model without a period of its own has the recording's, which can be read without the model's units.
+            left_out = getattr(c.model, "period", 1) is None
+            model: Model = build.make("model", period=_period(build) if left_out else None)
+            close, parts = _closer(build, model)
+            seen: Model = close.make("model") if parts > 1 else model
+            recording = _played(close, seen) if c.reality is not None else build.make("recording", model).read()
+            # A backend, a domain or a goal that does not fit is refused here, before the diagnosis is paid for.
+            asks = c.backend is not None or (c.reality is not None and c.certificate is not None)
+            against = build.against(model) if asks and c.domain is not None else None
+            if against is not None and c.controller is not None:
+                build.make("controller").check(model, against[1], build.spec.goal(against[1]))
+        with stages.stage("diagnosis"):
+            hold_out = asked.hold_out.model_dump(exclude_none=True, by_alias=True)
+            found = diagnose(
+                seen,
+                recording,
+                asked.effects,
+                hold_out=hold_out,
+                train=None if asked.train is None else asked.train.model_dump(exclude_none=True),
+                horizons=tuple(asked.horizons),
+                window=asked.window,
+                experiment=None if asked.experiment is None else asked.experiment.model_dump(),
+                seed=c.seed,
+                emit=stages.emit,
+                folder=folder,
+            )
+        if parts > 1:
+            found = replace(found, extended_model=_paced(found.extended_model, 1 / parts))
+        stages.finished("diagnosis", diagnosis=found, recording=recording, bodies=(seen, *(against or ())[:1]))
+        summary: dict[str, Any] = {"sentence": found.sentence(), **found.summary()}
+        stages.timings |= {k: v for k, v in summary.pop("timings").items() if k not in stages.timings}
+        summary |= left_behind(c.name, found, folder)
+        certificate = None
+        if against is not None:
+            summary["recertified"], certificate = _recertify(build, stages, *against, model, found, folder)
+        return Outcome(summary, {"diagnosis": found, "certificate": certificate})
 
 
 def _period(build: Build) -> float:

@@ -201,7 +201,7 @@ class EffectContract(ABC):
             at = [s.name for s in m.channels].index(c.site)
             seen = c.effect.seen_in(np.concatenate(m.outputs)[:, at])
             if seen is not None:
-                return {n: seen[p.name] for n, p in zip(names, c.effect.parameters, strict=True)}
+                return {n: seen[p.name] for n, p in library.parameters(c).items()}
         windows = m.windows(m.samples(self.window))
         h = library.hypothesis((c,))
         rows = np.tile(h.value, (len(library.starts(c)), 1))

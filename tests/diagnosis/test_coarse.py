@@ -38,7 +38,7 @@ def rung():
 def told(recording, integrator, substeps, extra=()):
     model = equations({**SHAFT, "integrator": integrator, "substeps": substeps})
     windows = Dataset.of(model, recording).windows(160)
-    return coarse(fit(Hypothesis(model), windows), windows)
+    return coarse(fit(Hypothesis(model), windows))
 
 
 @pytest.mark.exam
@@ -83,7 +83,7 @@ def test_an_error_of_order_one_without_a_fast_mode_is_not_told():
     recording = hide(model, [], x0=[1.0, 0.0], u=multisine(6.0, 0.01, 0.5, (0.2, 2.5), 4), noise={"q": 1e-5}, seed=1)
     windows = Dataset.of(model, recording).windows(100)
     found = fit(Hypothesis(model), windows)
-    assert coarse(found, windows) == ()
+    assert coarse(found) == ()
     half = fit(Hypothesis(stepped(model, 2)), windows)
     assert np.sqrt(half.chi.max()) > 1.5
 

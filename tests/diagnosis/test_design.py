@@ -7,8 +7,7 @@ import pytest
 
 import gapcert as gc
 from gapcert_diagnosis.data.dataset import Dataset
-from gapcert_diagnosis.experiment.design import Limits, Rivalry, design
-from gapcert_diagnosis.experiment.excitation import BACK, shapes
+from gapcert_diagnosis.experiment import BACK, Limits, Rivalry, design, shapes
 from gapcert_diagnosis.fitting.fit import fit, promising
 from gapcert_diagnosis.results import Experiment
 from gapcert_diagnosis.search.candidates import Library

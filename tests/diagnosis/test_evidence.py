@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ import pytest
 from gapcert import Recording, UsageError
 from gapcert.testing import multisine
 from gapcert_diagnosis.data.dataset import Dataset
-from gapcert_diagnosis.fitting.fit import Fit, Hypothesis, fit
+from gapcert_diagnosis.fitting.fit import Fit, fit
+from gapcert_diagnosis.fitting.hypothesis import Hypothesis
 from gapcert_diagnosis.search.candidates import Candidate, Library
 from gapcert_diagnosis.search.criterion import agreement, better, falls, noise
 from gapcert_diagnosis.search.fitted_sets import FittedSets
@@ -112,7 +114,7 @@ def test_intervals_hold_the_truth_when_nothing_is_hidden(effect):
         c = search.library.candidates[0]
         fitted = search.fit((c,), ((), search.nothing))
         inside.append(abs(fitted.theta[0]) <= 1.5 * fitted.interval()[0])
-        assert better(fitted, search.nothing) < search.library.threshold
+        assert better(fitted, search.nothing) < search.library.charge()
     assert sum(inside) >= 3
 
 
@@ -149,7 +151,12 @@ def residuals(rho, n=40_000, seed=0):
     for k in range(1, n):
         e[k] = rho * e[k - 1] + math.sqrt(1 - rho**2) * e[k]
     model = equations(SEMI)
-    return Fit(Hypothesis(model), np.empty(0), np.empty((1, 2)), e.reshape(1, n, 1), 0.0, np.empty((0, 0)))
+    return seen(Hypothesis(model), e.reshape(1, n, 1))
+
+
+def seen(h, r):
+    """A fit that leaves r (W, L, ny)."""
+    return Fit(h, np.empty(0), np.empty((len(r), 2)), r, 0.0, np.empty((0, 0)), SimpleNamespace(weight=np.ones_like(r)))
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.5, 0.9])
@@ -159,7 +166,7 @@ def test_coloured_residuals_count_for_less(rho):
 
 def test_a_little_above_the_floor_is_noise_however_many_samples_tell():
     plain = residuals(0.0)
-    above = (Fit(plain.hypothesis, plain.theta, plain.start, plain.residual * s, 0.0, plain.covariance) for s in (1.015, 1.05))
+    above = (replace(plain, residual=plain.residual * s) for s in (1.015, 1.05))
     assert [noise(fitted) for fitted in (plain, *above)] == [True, True, False]
 
 
@@ -175,8 +182,7 @@ def test_where_a_law_is_plainly_missing_windows_count_and_samples_do_not():
     noise = np.random.default_rng(1).standard_normal((12, 200, 1))
 
     def fitted(factor):
-        r = noise * np.sqrt(size * factor)[:, None, None]
-        return Fit(Hypothesis(equations(SEMI)), np.empty(0), np.empty((12, 2)), r, 0.0, np.empty((0, 0)))
+        return seen(Hypothesis(equations(SEMI)), noise * np.sqrt(size * factor)[:, None, None])
 
     plain, most = fitted(np.ones(12)), fitted(np.full(12, 0.7))
     one = fitted(np.r_[0.2, np.full(11, 1.02)])
@@ -192,11 +198,9 @@ def test_where_a_law_is_plainly_missing_windows_count_and_samples_do_not():
 def test_the_score_charges_for_parameters_and_not_below_the_floor():
     plain = residuals(0.0)
     charged = Hypothesis(plain.hypothesis.model, ("a",), *(np.array([v]) for v in (0.0, -1.0, 1.0, 0.1, np.inf)))
-    more = Fit(charged, np.zeros(1), plain.start, plain.residual, 0.0, np.eye(1))
+    more = replace(plain, hypothesis=charged, theta=np.zeros(1), covariance=np.eye(1))
     assert better(more, plain) == pytest.approx(-math.log(40_000))
-    tiny, tinier = (
-        Fit(plain.hypothesis, plain.theta, plain.start, plain.residual * s, 0.0, plain.covariance) for s in (0.1, 1e-6)
-    )
+    tiny, tinier = (replace(plain, residual=plain.residual * s) for s in (0.1, 1e-6))
     assert better(tinier, tiny) == 0
 
 

@@ -10,8 +10,8 @@ from gapcert.plugin import Extension, Memory
 from gapcert.testing import multisine
 from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.fitting import fit as fitting
-from gapcert_diagnosis.fitting.fit import Hypothesis, carried, fit, followed, stepped
-from gapcert_diagnosis.fitting.hypothesis import between
+from gapcert_diagnosis.fitting.fit import carried, fit, followed, stepped
+from gapcert_diagnosis.fitting.hypothesis import Hypothesis, between
 from gapcert_diagnosis.testing import ROD, equations
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
@@ -176,7 +176,7 @@ def test_one_step_from_a_fit_shows_how_well_other_simulations_fit():
         for d in (0.0, 0.03, -1e9)
     )
     base = fit(plain, windows)
-    own, found, broken = stepped(base, windows, [plain, right, huge])
+    own, found, broken = stepped(base, [plain, right, huge])
     assert broken is None
     assert own.chi[0] == pytest.approx(base.chi[0], rel=1e-3)
     assert base.chi[0] > 1.5

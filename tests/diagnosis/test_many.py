@@ -19,7 +19,7 @@ from gapcert_diagnosis.search import screening as screening
 from gapcert_diagnosis.search import stepwise as searching
 from gapcert_diagnosis.search.alternatives import answered
 from gapcert_diagnosis.search.candidates import Library
-from gapcert_diagnosis.search.criterion import keys, noise, values
+from gapcert_diagnosis.search.criterion import keys, noise
 from gapcert_diagnosis.search.fitted_sets import FittedSets
 from gapcert_diagnosis.search.gains import GainTable
 from gapcert_diagnosis.search.moves import additions, idle, replacements
@@ -171,7 +171,7 @@ def test_rivals_of_a_cause_are_single_laws_that_do_not_contain_it():
     for causes in rivals:
         assert len(causes) == 1
         assert not library.contains(causes[0].effect.name, "coulomb-friction")
-    assert values(answer.fit)["coulomb_friction_b"] == pytest.approx(0.05, rel=0.1)
+    assert answer.fit.values["coulomb_friction_b"] == pytest.approx(0.05, rel=0.1)
 
 
 @pytest.mark.exam
@@ -192,7 +192,7 @@ def test_of_very_many_candidates_some_are_piled_up(monkeypatch):
     monkeypatch.setattr(searching, "additions", None)
     found = few.forward()
     assert keys(found[0]) == truth
-    assert values(found[1])["input_gain_w"] == pytest.approx(0.7, rel=0.01)
+    assert found[1].values["input_gain_w"] == pytest.approx(0.7, rel=0.01)
     monkeypatch.setattr(GainTable, "pairs", None)  # a pile of all candidates needs no pairs beside it
     assert few.try_pairs(found) is found
     monkeypatch.setattr(searching, "THRESHOLDS", replace(searching.THRESHOLDS, alone_promise=0.0))

@@ -9,9 +9,8 @@ import pytest
 import gapcert as gc
 from gapcert.contracts.plugins.component import Context
 from gapcert_diagnosis.native.candidates import native_candidates
-from gapcert_diagnosis.native.response_surface import Surface, descend, design
 from gapcert_diagnosis.native.rollouts import ErrorStore, Motions, channels
-from gapcert_diagnosis.native.stepwise import EngineSearch, NativeFit
+from gapcert_diagnosis.native.stepwise import EngineSearch, NativeFit, Surface, descend, design
 from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_engines.native_model import NativeModel
 

@@ -8,8 +8,7 @@ import pytest
 import gapcert as gc
 from gapcert.testing import multisine
 from gapcert_diagnosis.data.dataset import Dataset
-from gapcert_diagnosis.fitting.hypothesis import Hypothesis
-from gapcert_diagnosis.fitting.memory_states import recalled
+from gapcert_diagnosis.fitting.hypothesis import Hypothesis, recalled
 from gapcert_diagnosis.testing import CART, equations
 
 PERIOD = 0.01

@@ -10,17 +10,15 @@ from exams.hidden.draw import single
 import gapcert as gc
 from gapcert.testing import multisine
 from gapcert_diagnosis.data.dataset import Dataset
-from gapcert_diagnosis.experiment.design import Limits, told_apart
-from gapcert_diagnosis.search import effect_size as effort
+from gapcert_diagnosis.experiment import Limits, told_apart
 from gapcert_diagnosis.search import gains
 from gapcert_diagnosis.search import screening as screen
 from gapcert_diagnosis.search.alternatives import answered, flags, smallest
 from gapcert_diagnosis.search.candidates import Library
-from gapcert_diagnosis.search.criterion import better, keys, richer, values
+from gapcert_diagnosis.search.criterion import better, keys, richer
 from gapcert_diagnosis.search.fitted_sets import FittedSets
 from gapcert_diagnosis.search.moves import spared, swaps
-from gapcert_diagnosis.search.stepwise import EquationSearch
-from gapcert_diagnosis.search.validation import drop_unconfirmed, search_windows
+from gapcert_diagnosis.search.stepwise import EquationSearch, drop_unconfirmed, search_windows
 from gapcert_diagnosis.testing import ROD, equations
 
 T, PERIOD = 1400, 0.01
@@ -101,7 +99,7 @@ def test_one_law_of_a_family_does_not_crowd_out_the_others_and_nested_ones_are_t
     model, recording = simulated(LOOSE, [(name, "q", numbers)])
     answer = named(model, recording)
     assert names(answer) == [name]
-    found = [values(answer.fit)[n] for n in answer.search.library.names(answer.causes[0])]
+    found = [answer.fit.values[n] for n in answer.search.library.names(answer.causes[0])]
     assert found[0] == pytest.approx(numbers[0], rel=0.1)
     for tie, _ in answer.ties:
         assert not answer.search.library.contains(tie[0].effect.name, name)
@@ -114,7 +112,7 @@ def test_what_hides_in_the_stated_values_is_screened_by_its_prior():
     search = FittedSets(library, windows)
     _, long = search.promises(((), search.nothing))
     (mass,) = (s for s in long if keys(s.move) == {("parameter", "m")})
-    assert mass.gain > library.threshold
+    assert mass.gain > library.charge()
     assert mass.values["m"] == pytest.approx(1.25, rel=0.1)
     answer = named(model, recording)
     assert {("parameter", "m")} in [keys(answer.causes), *(keys(t) for t, _ in answer.ties)]
@@ -137,7 +135,7 @@ def test_a_level_that_only_later_data_reach_is_found_there():
     u[round(0.6 * T) :] *= 4  # the last quarter is held out, and the quarter of the rest before it judges what was found
     answer = named(*simulated(LOOSE, [("input-saturation", "u", (1.2,))], u=u[:, :1]))
     assert names(answer) == ["input-saturation"]
-    assert values(answer.fit)["input_saturation_u"] == pytest.approx(1.2, rel=0.05)
+    assert answer.fit.values["input_saturation_u"] == pytest.approx(1.2, rel=0.05)
 
 
 def test_inside_its_tolerance_a_parameter_is_no_cause():
@@ -148,7 +146,7 @@ def test_inside_its_tolerance_a_parameter_is_no_cause():
 def test_a_saturation_far_below_what_was_asked_is_found(level):
     answer = named(*simulated(LOOSE, [("input-saturation", "u", (level,))]))
     assert names(answer) == ["input-saturation"]
-    assert values(answer.fit)["input_saturation_u"] == pytest.approx(level, rel=0.02)
+    assert answer.fit.values["input_saturation_u"] == pytest.approx(level, rel=0.02)
 
 
 def test_a_needle_between_two_starts_is_found_by_a_local_scan(monkeypatch):
@@ -179,7 +177,7 @@ def test_a_cause_below_one_per_cent_of_the_effort_is_listed_and_not_named():
     assert found[0] == ()
     (key, share) = next((k, s) for k, s in search.negligible.items() if k[0] == "viscous-friction")
     assert key == ("viscous-friction", "q")
-    assert 0.001 < share < effort.THRESHOLDS.least_effort
+    assert 0.001 < share < screen.THRESHOLDS.least_effort
 
 
 @pytest.mark.exam
@@ -211,7 +209,7 @@ def test_later_data_judge_the_whole_set_and_then_each_member():
     library, windows = prepared(model, mixed)
     earlier, later = windows.guard()
     search = FittedSets(library, earlier)
-    both = search.fit(best[0], None, values(best[1]))
+    both = search.fit(best[0], None, best[1].values)
     assert [c.effect.name for c in drop_unconfirmed(search, (best[0], both), later)[0]] == ["cubic-spring"]
 
 
@@ -243,7 +241,7 @@ def test_the_same_law_at_all_joints_is_one_move():
     assert keys(both.move) == set(moves[-3])
     search, found = search_windows(library, windows)
     assert keys(found[0]) == {("coulomb-friction", "a"), ("coulomb-friction", "b")}
-    assert values(found[1])["coulomb_friction_b"] == pytest.approx(0.02, rel=0.1)
+    assert found[1].values["coulomb_friction_b"] == pytest.approx(0.02, rel=0.1)
 
 
 def test_equal_explanations_are_named_by_the_simplest_and_no_experiment_is_promised():
@@ -283,7 +281,7 @@ def test_what_would_have_been_seen_is_of_the_size_that_is_seen():
         _, hidden = simulated(LOOSE, [("viscous-friction", "q", (factor * least.value,))])
         search = FittedSets(*prepared(model, hidden))
         (c,) = (c for c in library.candidates if c.effect.name == "viscous-friction")
-        assert (better(search.fit((c,), ((), search.nothing)), search.nothing) > library.threshold) == seen
+        assert (better(search.fit((c,), ((), search.nothing)), search.nothing) > library.charge()) == seen
 
 
 def test_values_that_are_not_plausible_are_flagged():
@@ -345,7 +343,7 @@ def test_where_samples_cannot_be_counted_a_law_is_weighed_at_all_its_sites_at_on
         assert (keys(rich) in options) == search.cautious
     # The sites start where they were, each with its own rate.
     start = options[keys(rich)]
-    assert [start[library.names(c)[0]] for c in rich] == [values(found[1])[library.names(c)[0]] for c in plain]
+    assert [start[library.names(c)[0]] for c in rich] == [found[1].values[library.names(c)[0]] for c in plain]
     assert spared(search, rich, (plain[0], rich[1]))
     assert not spared(search, rich, plain)
     assert not spared(search, plain, (rich[0], plain[1]))
@@ -365,6 +363,6 @@ def test_a_larger_set_must_pay_for_itself_on_whatever_path_it_was_found():
     )
     few = (viscous,), search.fit((viscous,), None)
     more = (viscous, dry), search.fit((viscous, dry), few)
-    assert search.better(more[1], few[1]) > library.threshold
+    assert search.better(more[1], few[1]) > library.charge()
     assert not EquationSearch(search).outdoes(more, few)
     assert EquationSearch(search).outdoes(few, ((), search.nothing))

@@ -7,7 +7,7 @@ import gapcert as gc
 import gapcert_engines
 from gapcert.testing import multisine
 from gapcert_diagnosis.data.dataset import Dataset
-from gapcert_diagnosis.experiment.design import Limits
+from gapcert_diagnosis.experiment import Limits
 from gapcert_mujoco.config import MuJoCoConfig
 from gapcert_report.words.summary import in_words
 

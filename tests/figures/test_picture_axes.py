@@ -65,8 +65,9 @@ def test_a_slow_plant_has_lags_too(period, lags):
     )
     windows = SimpleNamespace(measured=measured, length=120, u=rng.standard_normal((9, 121, 1)))
     model = SimpleNamespace(nu=1, inputs=(StateSpec("q", "m^3/s"),))
-    fits = [SimpleNamespace(residual=rng.standard_normal((9, 120, 1)), hypothesis=SimpleNamespace(model=model)) for _ in "ab"]
-    own, driven = _correlations(windows, *fits)
+    known = {"hypothesis": SimpleNamespace(model=model), "windows": windows}
+    fits = [SimpleNamespace(residual=rng.standard_normal((9, 120, 1)), **known) for _ in "ab"]
+    own, driven = _correlations(*fits)
     assert (len(own.lag), len(driven.lag)) == (lags, 2 * lags + 1)
     assert own.lag[-1] == pytest.approx(lags * period)
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, final
+from typing import Any, TypeVar, final
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +15,8 @@ from gapcert.plugin import Array, Hold, Model, Recording, StateSpec, UsageError
 from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_recordings import JITTER, Log, Piece, pieces
 
+K = TypeVar("K")
+V = TypeVar("V")
 _HOLDS: tuple[Hold, ...] = ("zero", "first")
 
 
@@ -122,10 +124,6 @@ class Dataset:
         """Is there no noise, as in what a simulator says?"""
         return bool((self.sigma <= (1 + 1e-9) * THRESHOLDS.least_floor * self.spread).all())
 
-    def with_hold(self, hold: Hold | None) -> Dataset:
-        """The same data with the input held in a given way."""
-        return replace(self, hold=hold)
-
     def samples(self, seconds: float) -> int:
         return max(1, round(seconds / self.period))
 
@@ -225,7 +223,7 @@ class Windows:
 
     def with_hold(self, hold: Hold) -> Windows:
         """The same windows with the input held in a given way."""
-        return replace(self, measured=self.measured.with_hold(hold))
+        return replace(self, measured=replace(self.measured, hold=hold))
 
     def retraced(self, x: Array) -> tuple[Windows, npt.NDArray[np.bool_]]:
         """The same windows in a recording whose guessed states are those of motions x (W, L, nx), as far as these reach.
@@ -348,3 +346,10 @@ def _driven(model: Model) -> list[tuple[int, int]]:
 def flat(a: Array) -> Array:
     """(…, k) as rows (n, k), for k = 0 too."""
     return a.reshape(math.prod(a.shape[:-1]), a.shape[-1])
+
+
+def once(known: dict[K, V], key: K, make: Callable[[], V]) -> V:
+    """What is kept under a key, made the first time."""
+    if key not in known:
+        known[key] = make()
+    return known[key]

@@ -18,8 +18,7 @@ from gapcert_diagnosis.data.dataset import Windows
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .gauss_newton import Slopes, fall, reduced, squares, steps
-from .hypothesis import Hypothesis as Hypothesis
-from .hypothesis import nudges
+from .hypothesis import Hypothesis, nudges
 
 TRIALS = np.array([0.1, 1.0, 10.0, 100.0])
 
@@ -27,10 +26,10 @@ TRIALS = np.array([0.1, 1.0, 10.0, 100.0])
 @final
 @dataclass(frozen=True)
 class Fit:
-    """The best numbers theta (p,) and starts (W, nx) of a hypothesis; residual (W, L, ny) in units of the noise floor.
+    """The best numbers theta (p,) and starts (W, nx) of a hypothesis on some windows.
 
-    covariance (p, p): of theta with the starts profiled out, per unit of residual variance. weight (W, L, ny): of the
-    samples, None for all alike; the residual is multiplied by it. place (W, 2): piece and first sample of the windows.
+    residual (W, L, ny): in units of the noise floor, times the weights of the windows. covariance (p, p): of theta with the
+    starts profiled out, per unit of residual variance.
     """
 
     hypothesis: Hypothesis
@@ -39,14 +38,12 @@ class Fit:
     residual: Array
     prior: float
     covariance: Array
-    weight: Array | None = None
-    place: Array | None = None
+    windows: Windows
 
     @cached_property
     def counts(self) -> Array:
         """Samples (ny,) that took part."""
-        w, length, ny = self.residual.shape
-        return np.full(ny, float(w * length)) if self.weight is None else np.sum(self.weight**2, axis=(0, 1))
+        return np.asarray(np.sum(self.windows.weight**2, axis=(0, 1)))
 
     @cached_property
     def chi(self) -> Array:
@@ -56,25 +53,27 @@ class Fit:
     @cached_property
     def whiteness(self) -> Array:
         """κ (ny,) = (1 − ρ₁)/(1 + ρ₁): the share of samples that count as independent, from the lag-1 autocorrelation."""
-        r, w = self.residual, self.weight
-        rho = lag_one(r)
-        if w is not None:
-            # Of as many neighbours as there would be without gaps.
-            whole = self.counts * (w.shape[1] - 1) / w.shape[1]
-            rho = rho * whole / np.maximum(np.sum((w[:, 1:] * w[:, :-1]) ** 2, axis=(0, 1)), 1)
+        w = self.windows.weight
+        # Of as many neighbours as there would be without gaps.
+        whole = self.counts * (w.shape[1] - 1) / w.shape[1]
+        rho = lag_one(self.residual) * whole / np.maximum(np.sum((w[:, 1:] * w[:, :-1]) ** 2, axis=(0, 1)), 1)
         return np.asarray(np.clip((1 - rho) / (1 + rho), 0.02, 1.0))
 
     @cached_property
     def each(self) -> Array:
         """χ (W, ny) of every window; less than the noise floor counts as the floor."""
-        w, length, ny = self.residual.shape
-        counts = np.full((w, ny), float(length)) if self.weight is None else np.sum(self.weight**2, axis=1)
-        return np.asarray(np.maximum(np.sum(self.residual**2, axis=1) / np.maximum(counts, 1), THRESHOLDS.counted_floor))
+        chi = np.sum(self.residual**2, axis=1) / np.maximum(np.sum(self.windows.weight**2, axis=1), 1)
+        return np.asarray(np.maximum(chi, THRESHOLDS.counted_floor))
 
     @cached_property
     def typical(self) -> Array:
         """χ (ny,) of a typical window: the geometric mean, in which a window that nothing fits has one voice."""
         return np.asarray(np.exp(np.mean(np.log(self.each), axis=0)))
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Name → fitted number."""
+        return dict(zip(self.hypothesis.names, self.theta.tolist(), strict=True))
 
     @property
     def rough(self) -> bool:
@@ -127,7 +126,7 @@ def fit(
                 "recording.units: {TIME: ms}; otherwise look at the model's units and signs, the recording's columns, or give "
                 "a shorter diagnose.window"
             )
-    ends = _Ends.of(windows)
+    ends, given = _Ends.of(windows), windows
     here = _descended(h, windows, here, ends, iterations)
     for _ in range(THRESHOLDS.retraced_memories if h.model.remembers else 0):
         if (again := _retraced(h, windows, here)) is None:
@@ -138,7 +137,29 @@ def fit(
     schur = reduced(h, here, temper, np.zeros(1))[0][0]
     size = here.width[: len(theta)]
     covariance = np.asarray(np.linalg.pinv(schur) * np.outer(size, size))
-    return Fit(h, here.theta, here.start, here.residual, float(h.prior(here.theta)), covariance, windows.weight, windows.place)
+    return Fit(h, here.theta, here.start, here.residual, float(h.prior(here.theta)), covariance, given)
+
+
+def rescued(fitted: Fit) -> Fit:
+    """The fit again from better starts of the windows that stand out, where that makes it better; else as it was.
+
+    A start velocity that is off by the noise of a difference can lead a long window over an unstable equilibrium or around
+    another turn; over a short one it cannot.
+    """
+    energy = np.mean(fitted.residual**2, axis=(1, 2))
+    lost = np.flatnonzero(energy > THRESHOLDS.lost_window * max(1.0, float(np.median(energy))))
+    if not len(lost):
+        return fitted
+    windows = fitted.windows
+    some, fixed = windows.take(lost), fitted.hypothesis.holding(fitted.theta)
+    start = some.start
+    for part in THRESHOLDS.restart_parts:
+        head = some.head(max(THRESHOLDS.window_samples, windows.length // part))
+        start = fit(fixed, head, start=start).start
+    starts = fitted.start.copy()
+    starts[lost] = start
+    again = fit(fitted.hypothesis, windows, theta=fitted.theta, start=starts)
+    return again if np.sum(again.residual**2) + again.prior < np.sum(fitted.residual**2) + fitted.prior else fitted
 
 
 def followed(h: Hypothesis, theta: Array, windows: Windows, start: Array | None = None) -> Fit:
@@ -155,7 +176,7 @@ def followed(h: Hypothesis, theta: Array, windows: Windows, start: Array | None 
     if _followable(r[rows]):
         return fit(fixed, windows, start=starts[rows])
     lost, none = np.full(r.shape[1:], THRESHOLDS.blown_residual), np.empty((0, 0))
-    return Fit(fixed, np.empty(0), windows.start, lost, 0.0, none, windows.weight, windows.place)
+    return Fit(fixed, np.empty(0), windows.start, lost, 0.0, none, windows)
 
 
 def carried(h: Hypothesis, theta: Array, other: Fit, windows: Windows, start: Array) -> Array:
@@ -163,7 +184,7 @@ def carried(h: Hypothesis, theta: Array, other: Fit, windows: Windows, start: Ar
 
     start: of a fit of these windows.
     """
-    known = {} if other.place is None else dict(zip(map(tuple, other.place.tolist()), other.start, strict=True))
+    known = dict(zip(map(tuple, other.windows.place.tolist()), other.start, strict=True))
     rows = [known.get(tuple(place)) for place in windows.place.tolist()]
     new = np.array([row is None for row in rows])
     out = np.stack([own if row is None else row for row, own in zip(rows, start, strict=True)])
@@ -172,12 +193,12 @@ def carried(h: Hypothesis, theta: Array, other: Fit, windows: Windows, start: Ar
     return out
 
 
-def stepped(fitted: Fit, windows: Windows, others: Sequence[Hypothesis]) -> list[Fit | None]:
-    """Other simulations with the numbers of a fit on these windows, each one Gauss–Newton step from it; None: not finite.
+def stepped(fitted: Fit, others: Sequence[Hypothesis]) -> list[Fit | None]:
+    """Other simulations with the numbers of a fit on its windows, each one Gauss–Newton step from it; None: not finite.
 
     The slopes are those of the fit, which is all that many simulations cost that differ little from its own.
     """
-    h, theta, start = fitted.hypothesis, fitted.theta, fitted.start
+    h, theta, start, windows = fitted.hypothesis, fitted.theta, fitted.start, fitted.windows
     thetas, starts, width = nearby(h, theta, start, _linearise(h, windows, theta, start).near(h))
     r = _residual(h, windows, thetas, starts)
     moved, n, out = r[1:] - r[0], max(1.0, float(np.count_nonzero(windows.weight))), list[Fit | None]()
@@ -190,7 +211,7 @@ def stepped(fitted: Fit, windows: Windows, others: Sequence[Hypothesis]) -> list
         cost = squares(trials) + temper * other.prior(theta + moves)
         k = int(np.argmin(np.where(np.isfinite(cost), cost, np.inf)))
         ends = theta + moves[k], start + shifts[k], trials[k]
-        known = Fit(other, *ends, float(other.prior(ends[0])), fitted.covariance, windows.weight, windows.place)
+        known = Fit(other, *ends, float(other.prior(ends[0])), fitted.covariance, windows)
         out.append(known if np.isfinite(cost[k]) else None)
     return out
 
@@ -303,9 +324,9 @@ def promising(h: Hypothesis, windows: Windows, thetas: Array, start: Array) -> t
     return best
 
 
-def slopes(fitted: Fit, windows: Windows) -> Array:
+def slopes(fitted: Fit) -> Array:
     """What moving each number of a fit by a step adds to the residual, (W, L·ny, p); 0 where that is not finite."""
-    h, p = fitted.hypothesis, len(fitted.theta)
+    h, p, windows = fitted.hypothesis, len(fitted.theta), fitted.windows
     step = _linearise(h, windows, fitted.theta, fitted.start).near(h)
     thetas, starts, _ = nearby(h, fitted.theta, fitted.start, step)
     r = _residual(h, windows, thetas[: 1 + p], starts[: 1 + p])

@@ -119,12 +119,12 @@ def steps(h: Hypothesis, here: Slopes, temper: float, damping: Array) -> tuple[A
     schur, side, a, b = reduced(h, here, temper, damping)
     theta, p = here.theta, len(here.theta)
     limits = np.sort([(h.low - theta) / here.width[:p], (h.high - theta) / here.width[:p]], axis=0)
-    moves = np.stack([_bounded(s, r, *limits) for s, r in zip(schur, side, strict=True)])
+    moves = np.stack([bounded(s, r, *limits) for s, r in zip(schur, side, strict=True)])
     shifts = -(b + np.einsum("kwij,kj->kwi", a, moves))
     return np.clip(moves * here.width[:p], h.low - theta, h.high - theta), shifts * here.width[p:]
 
 
-def _bounded(schur: Array, side: Array, low: Array, high: Array) -> Array:
+def bounded(schur: Array, side: Array, low: Array, high: Array) -> Array:
     """schur·move = side within bounds: what leaves them is held there, and the rest solved again."""
     free, move = np.ones(len(side), dtype=bool), np.zeros(len(side))
     for _ in range(len(side)):

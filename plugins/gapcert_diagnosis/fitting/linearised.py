@@ -14,14 +14,13 @@ from typing import final
 
 import numpy as np
 
-from gapcert.plugin import Array, Model, difference
-from gapcert_diagnosis.data.dataset import Windows, flat
-from gapcert_diagnosis.search.candidates import probe, velocity
+from gapcert.plugin import Array, Extension, Model, Parameter, difference, site_units
+from gapcert_diagnosis.data.dataset import Windows, flat, once
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .fit import Fit
-from .hypothesis import nudges
-from .memory_states import recalled
+from .hypothesis import nudges, recalled
+from .step_size import built
 
 
 @final
@@ -138,22 +137,23 @@ def _rows(out: Array) -> Array:
 class Path:
     """The measured motion of windows at every model step, history first: x (W, P + S, nx), u (W, P + S, nu)."""
 
-    def __init__(self, windows: Windows, guess: Fit) -> None:
+    def __init__(self, windows: Windows, guess: Fit, start: Array) -> None:
+        """start (W, nx): of these windows, as the guess has them."""
         m, repeat = windows.measured, windows.measured.repeat
         self.windows, self.lead = windows, m.past
         steps = self.lead + (windows.length - 1) * repeat
         self.u = windows.drive[:, :steps]
         samples = np.stack([m.states[i][s - m.history : s + windows.length] for i, s in windows.place.tolist()])
-        self._fill(samples, guess)
+        self._fill(samples, guess, start)
         share = np.arange(repeat) / repeat
         between = samples[:, :-1, None] + share[:, None] * np.diff(samples, axis=1)[:, :, None]
         self.x, self.samples = between.reshape(len(windows), steps, -1), samples
 
-    def _fill(self, samples: Array, guess: Fit) -> None:
+    def _fill(self, samples: Array, guess: Fit, start: Array) -> None:
         """States that no channel shows are those of the fit."""
         blind, history = ~np.any(samples, axis=(0, 1)), self.windows.measured.history
         if blind.any():
-            motion = guess.hypothesis.motion(self.windows, guess.theta[None], guess.start[None])
+            motion = guess.hypothesis.motion(self.windows, guess.theta[None], start[None])
             found = np.nan_to_num(motion[:, :: max(1, motion.shape[1] // self.windows.length)][:, : self.windows.length])
             samples[:, history:, blind] = found[..., blind]
             samples[:, :history, blind] = found[:, :1, blind]
@@ -242,9 +242,9 @@ class Tangent:
     _made: dict[object, Array] = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
-    def of(cls, model: Model, windows: Windows, fitted: Fit) -> Tangent:
-        """model: linearised where the path of the fit on these windows lies."""
-        m, nx = windows.measured, model.nx
+    def of(cls, model: Model, fitted: Fit) -> Tangent:
+        """model: linearised where the path of the fit lies."""
+        windows, m, nx = fitted.windows, fitted.windows.measured, model.nx
         x = fitted.hypothesis.motion(windows, fitted.theta[None], fitted.start[None])
         u = windows.drive[:, m.past :][:, : x.shape[1]]
         at = flat(x[:, :: m.repeat]), flat(u[:, :: m.repeat])
@@ -260,11 +260,6 @@ class Tangent:
         A = model.jacobian(flat(x), flat(u))[:, :, :nx].reshape(*x.shape, nx) if model.hidden else _slopes(model, x, u)
         residual = -fitted.residual.reshape(len(windows), -1)
         return cls(model, windows, fitted, x, u, LinearisedMotion(A, observe, m.repeat), residual)
-
-    @property
-    def free(self) -> Array:
-        """An orthonormal basis (W, L·ny, nx) of what the start of a window makes."""
-        return self.linear.free
 
     def responses(self, site: str, force: Array) -> Array:
         """What forces (W, S, K) at a site do to the measured channels, (W, L·ny, K), with the starts free to follow."""
@@ -282,9 +277,7 @@ class Tangent:
 
     def once(self, key: object, make: Callable[[], Array]) -> Array:
         """What depends on the path alone, made when it is first asked for."""
-        if key not in self._made:
-            self._made[key] = make()
-        return self._made[key]
+        return once(self._made, key, make)
 
     def driven(self, B: Array, force: Array) -> Array:
         """The same for whatever moves the next state by B (W, S, nx) per unit."""
@@ -332,3 +325,33 @@ def _slopes(model: Model, x: Array, u: Array) -> Array:
     moved = np.concatenate([x, *(x + size * e for e in np.eye(nx))])
     new = model.along(moved, np.tile(u, (nx + 1, 1, 1))).reshape(nx + 1, *x.shape)
     return np.asarray(np.moveaxis(difference(model.states, new[1:], new[:1]), 0, -1) / size)
+
+
+def sliding(model: Model, site: str, x: Array, u: Array, plain: Array | None = None) -> Array:
+    """∂x⁺/∂f (n, nx) of the machine as it slides: what turns a change of the state into a force, also where friction holds."""
+    spec = model.to_spec()
+    if spec.get("dry_friction"):
+        return probe(built({**spec, "dry_friction": {}}), site, x, u)
+    return probe(model, site, x, u, plain)
+
+
+def probe(model: Model, site: str, x: Array, u: Array, plain: Array | None = None) -> Array:
+    """∂x⁺/∂f (n, nx) for a force f at a coordinate, held for one period; plain: x⁺ without it, where that is known."""
+    if "forces" in model.capabilities:
+        forces = np.zeros((len(x), model.substeps, len(model.coordinates)))
+        forces[..., model.coordinates.index(site)] = 1.0
+        plain = model.step(x, u).x if plain is None else plain
+        return difference(model.states, model.step(x, u, forces=forces).x, plain)
+    force = Parameter("probe_force", 0.0, site_units(model, "coordinate", site)["force"])
+    pushed = model.extend([Extension("probe", site, (force,), force=force.name)])
+    on, off = (pushed.step(x, u, parameters={"probe_force": f}).x for f in (1.0, 0.0))
+    return difference(model.states, on, off)
+
+
+def velocity(model: Model, site: str, response: Array) -> int:
+    """The column of the state that a force at `site` changes first: its velocity, or the state whose equation the site is."""
+    names = [s.name for s in model.states]
+    for name in (f"{site}_dot", site):
+        if name in names:
+            return names.index(name)
+    return int(np.argmax(np.abs(response).max(axis=0)))

@@ -9,7 +9,7 @@ from typing import final
 import numpy as np
 
 from gapcert.plugin import Array, UsageError, difference
-from gapcert_diagnosis.data.dataset import Dataset, Windows
+from gapcert_diagnosis.data.dataset import Dataset, Windows, once
 from gapcert_diagnosis.results import Gain
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
@@ -42,9 +42,7 @@ class Stretches:
 
     def simulate(self, fitted: Fit) -> Array:
         """Outputs (W, H, ny) of free rollouts; each fit is rolled out once."""
-        if id(fitted) not in self._rolled:
-            self._rolled[id(fitted)] = fitted, *self._simulated(fitted)
-        return self._rolled[id(fitted)][1]
+        return once(self._rolled, id(fitted), lambda: (fitted, *self._simulated(fitted)))[1]
 
     def _simulated(self, fitted: Fit) -> tuple[Array, Array]:
         """(outputs, starts); the search for starts begins where that of another fit ended, or at what was measured."""
@@ -88,26 +86,22 @@ class Stretches:
         return {c.name: Gain(*map(float, columns[:, i])) for i, c in enumerate(w.measured.channels)}
 
 
-def stretches(
-    held: Dataset, horizons: Sequence[float], seen: Dataset | None = None, fitted: Fit | None = None
-) -> tuple[Stretches, ...]:
+def stretches(held: Dataset, horizons: Sequence[float], fitted: Fit | None = None) -> tuple[Stretches, ...]:
     """One per horizon, shortest first.
 
-    A short lead leaves the start to noise, a long one to what the model lacks: where data that were fitted are given, the lead
-    is the one with the least error there.
+    A short lead leaves the start to noise, a long one to what the model lacks: where a fit is given, the lead is the one with
+    the least error on the data that it was made to.
     """
-    if not horizons:
-        raise UsageError("diagnose: no horizon is given; name at least one in seconds, such as [0.5]")
-    return tuple(Stretches.of(held, h, _lead(seen, h, fitted)) for h in sorted(horizons))
+    return tuple(Stretches.of(held, h, _lead(h, fitted)) for h in sorted(horizons))
 
 
-def _lead(seen: Dataset | None, horizon: float, fitted: Fit | None) -> float:
-    if seen is None or fitted is None:
+def _lead(horizon: float, fitted: Fit | None) -> float:
+    if fitted is None:
         return THRESHOLDS.rollout_leads[-1]
     leads = {}
     for lead in THRESHOLDS.rollout_leads:
         try:
-            leads[lead] = Stretches.of(seen, horizon, lead).error(fitted)
+            leads[lead] = Stretches.of(fitted.windows.measured, horizon, lead).error(fitted)
         except UsageError:
             break  # too little was fitted for so long a horizon; what is held out may be longer
     return min(leads, key=lambda k: leads[k]) if leads else THRESHOLDS.rollout_leads[-1]

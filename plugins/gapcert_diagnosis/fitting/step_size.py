@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from gapcert.plugin import Array, Model, registry
-from gapcert_diagnosis.data.dataset import Windows
 from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_engines import EngineModel
 
@@ -48,12 +47,12 @@ def fastest(model: Model, x: Array, u: Array) -> float:
         return float(np.abs(np.log(np.linalg.eigvals(slopes).astype(complex))).max())
 
 
-def coarse(last: Fit, windows: Windows) -> tuple[str, ...]:
+def coarse(last: Fit) -> tuple[str, ...]:
     """A sentence where half the model's step moves a fit by what is not small against what the fit leaves; none otherwise.
 
     Both are compared from starts of their own on a few windows, since another start takes out what only shifts a motion.
     """
-    h = last.hypothesis.holding(last.theta)
+    h, windows = last.hypothesis.holding(last.theta), last.windows
     fine = None if windows.measured.exact else stepped(h.model, 2 * h.model.substeps)
     if fine is None:
         return ()

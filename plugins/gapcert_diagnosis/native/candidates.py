@@ -73,6 +73,13 @@ class NativeCandidate:
         value = self.parameter.value * math.exp(z) if self.logarithmic else z * _scale(self.parameter)
         return float(np.clip(value, self.parameter.low, self.parameter.high))
 
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """(low, high) of that coordinate."""
+        assert self.parameter is not None
+        p = self.parameter
+        return math.log(max(p.low / p.value, 1e-4)) if self.logarithmic else self.to(p.low), self.to(p.high)
+
 
 def native_candidates(model: NativeModel, effects: Collection[str], *, simulated: bool) -> tuple[NativeCandidate, ...]:
     """All native parameters that realise one of these effects, and the settings of the engine that are no parameters.

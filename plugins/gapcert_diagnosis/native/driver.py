@@ -11,7 +11,7 @@ from typing import Any, final
 import numpy as np
 
 from gapcert.plugin import Array, Emit, Event, Model, Recording, UsageError, difference
-from gapcert_diagnosis.problem import Diagnoser, DiagnosisProblem
+from gapcert_diagnosis.diagnose import Diagnoser, DiagnosisProblem
 from gapcert_diagnosis.results import Cause, Diagnosis, Estimate, Gain, Misfit, Rival, Verdict
 from gapcert_diagnosis.search.criterion import agreement
 from gapcert_diagnosis.thresholds import THRESHOLDS
@@ -31,58 +31,53 @@ class NativeDiagnoser(Diagnoser):
         return isinstance(model, NativeModel)
 
     def diagnose(self, problem: DiagnosisProblem) -> Diagnosis:
-        assert isinstance(problem.model, NativeModel)
-        return diagnose_native(problem.model, problem)
+        """The native parameters and settings that are wrong: fitted to one part of a recording, judged on the other.
 
-
-def diagnose_native(model: NativeModel, problem: DiagnosisProblem) -> Diagnosis:
-    """The native parameters and settings that are wrong: fitted to one part of a recording, judged on the other.
-
-    Rollouts start from measured states, in flight from what its first samples say, over a short window and over the longest
-    horizon; a horizon longer than a trajectory ends with it. A trajectory is one voice: causes are named where trajectories
-    that a fit has not seen agree, beyond chance among so many candidates; intervals come from drawing trajectories again.
-    """
-    parts, horizons, seed, lap = (problem.fitted, problem.held_out), problem.horizons, problem.seed, problem.clock.lap
-    fitted, held = _checked(model, parts)
-    if not horizons:
-        raise UsageError("diagnose: no horizon is given; name at least one in seconds, such as [0.5]")
-    tell = _counted(problem.clock.emit)
-    entries = native_candidates(model, {e.name for e in problem.effects}, simulated=bool(parts[0].noise))
-    store = ErrorStore(None if problem.folder is None else problem.folder / "scores")
-    lap("evidence")
-    search = EngineSearch(
-        model, fitted, entries, sorted({problem.window or THRESHOLDS.contact_window, max(horizons)}), store, tell
-    )
-    best = search.select()
-    lap("search")
-    judge = _Judge(held, tuple(sorted(horizons)), store)
-    causes = tuple(_named(search, best, c, judge, seed) for c in best.causes)
-    lap("rivals")
-    gain = judge.gains(model, best.model, seed)
-    lap("gain")
-    left = _left(search.few, best.model, min(search.horizons), seed)
-    visible = _visible(search, best)
-    lap("leftover")
-    verdict = _verdict(causes, left, judge.error(model), judge.error(best.model))
-    if causes and (bad := {n: v for n, v in left.items() if v > THRESHOLDS.left_errors}):
-        worst = max(bad, key=lambda n: bad[n])
-        text = f"inadequate: over {min(search.horizons):g} s, errors of {worst} are still {bad[worst]:.2g} times those of noise"
-        causes = (*causes[:-1], replace(causes[-1], flags=(*causes[-1].flags, text)))
-    return Diagnosis(
-        verdict,
-        causes,
-        _misfits(search, best),
-        gain,
-        best.model,
-        _ties(search, best),
-        None,
-        None,
-        _figure(search, judge, best),
-        negligible=tuple((*k, s) for k, s in search.negligible.items() if k not in {c.key for c in best.causes}),
-        evidence={"error over that of noisy starts": left},
-        log={"trajectories fitted": len(fitted), "trajectories held out": len(held),
-             "error": "mean length of the difference from measured starts", **visible},
-    )  # fmt: skip
+        Rollouts start from measured states, in flight from what its first samples say, over a short window and over the longest
+        horizon; a horizon longer than a trajectory ends with it. A trajectory is one voice: causes are named where trajectories
+        that a fit has not seen agree, beyond chance among so many candidates; intervals come from drawing trajectories again.
+        """
+        model = problem.model
+        assert isinstance(model, NativeModel)
+        parts, horizons, seed, lap = (problem.fitted, problem.held_out), problem.horizons, problem.seed, problem.clock.lap
+        fitted, held = _checked(model, parts)
+        tell = _counted(problem.clock.emit)
+        entries = native_candidates(model, {e.name for e in problem.effects}, simulated=bool(parts[0].noise))
+        store = ErrorStore(None if problem.folder is None else problem.folder / "scores")
+        lap("evidence")
+        search = EngineSearch(
+            model, fitted, entries, sorted({problem.window or THRESHOLDS.contact_window, max(horizons)}), store, tell
+        )
+        best = search.select()
+        lap("search")
+        judge = _Judge(held, tuple(sorted(horizons)), store)
+        causes = tuple(_named(search, best, c, judge, seed) for c in best.causes)
+        lap("rivals")
+        gain = judge.gains(model, best.model, seed)
+        lap("gain")
+        left = _left(search.few, best.model, min(search.horizons), seed)
+        visible = _visible(search, best)
+        lap("leftover")
+        verdict = _verdict(causes, left, judge.error(model), judge.error(best.model))
+        if causes and (bad := {n: v for n, v in left.items() if v > THRESHOLDS.left_errors}):
+            worst, short = max(bad, key=lambda n: bad[n]), min(search.horizons)
+            text = f"inadequate: over {short:g} s, errors of {worst} are still {bad[worst]:.2g} times those of noise"
+            causes = (*causes[:-1], replace(causes[-1], flags=(*causes[-1].flags, text)))
+        return Diagnosis(
+            verdict,
+            causes,
+            _misfits(search, best),
+            gain,
+            best.model,
+            _ties(search, best),
+            None,
+            None,
+            _figure(search, judge, best),
+            negligible=tuple((*k, s) for k, s in search.negligible.items() if k not in {c.key for c in best.causes}),
+            evidence={"error over that of noisy starts": left},
+            log={"trajectories fitted": len(fitted), "trajectories held out": len(held),
+                 "error": "mean length of the difference from measured starts", **visible},
+        )  # fmt: skip
 
 
 def _checked(model: NativeModel, parts: tuple[Recording, Recording]) -> tuple[Motions, Motions]:
@@ -171,13 +166,9 @@ def _estimates(best: NativeFit, c: NativeCandidate, seed: int) -> dict[str, Esti
 
 
 def _verdict(causes: tuple[Cause, ...], left: Mapping[str, float], before: float, after: float) -> Verdict:
-    if causes:
-        return (
-            "causes"
-            if after < (1 - THRESHOLDS.enough_explained) * before or max(left.values()) <= THRESHOLDS.left_errors
-            else "unexplained"
-        )
-    return "nothing" if max(left.values()) <= THRESHOLDS.left_errors else "unexplained"
+    if max(left.values()) <= THRESHOLDS.left_errors:
+        return "causes" if causes else "nothing"
+    return "causes" if causes and after < (1 - THRESHOLDS.enough_explained) * before else "unexplained"
 
 
 def _misfits(search: EngineSearch, best: NativeFit) -> dict[str, Misfit]:

@@ -14,25 +14,14 @@ from typing import final
 
 import numpy as np
 
-from gapcert.plugin import DAMAGE, Array, Recording, UsageError, difference, npz_bytes, write_atomic
-from gapcert_diagnosis.data.initial_states import flying, settled
-from gapcert_diagnosis.search.candidates import once
+from gapcert.plugin import DAMAGE, Array, Recording, UsageError, difference, npz_bytes, rotated, write_atomic
+from gapcert_diagnosis.data.dataset import once
 from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_engines import Group, NativeModel
 
+from .candidates import CONTACT, tried
 
-@final
-class _Recent:
-    """The last rollouts: place → (states, steps). A longer horizon goes on where a shorter one ends."""
-
-    def __init__(self) -> None:
-        self.model: NativeModel | None = None
-        self.rows: dict[tuple[int, int], tuple[Array, int]] = {}
-
-    def begun(self, model: NativeModel, place: tuple[int, int], x: Array) -> Array:
-        """What is known of the rollout of a model from x: at least x."""
-        states, steps = self.rows.get(place, (x[None], 0)) if model is self.model else (x[None], 0)
-        return states[: steps + 1] if states[0].tobytes() == x.tobytes() else x[None]
+_PAIRS = (("position", "velocity"), ("rotation", "rate"))
 
 
 @final
@@ -40,7 +29,8 @@ class _Recent:
 class Motions:
     """Trajectories as states (T, nx) and inputs (T, nu) of a model, one sample per period.
 
-    sigma, spread (G,): noise floor and size of each group of states. exact: of a simulator, whose states are starts.
+    sigma, spread (G,): noise floor and size of each group of states. exact: of a simulator, whose states are starts. recent:
+    the last rollouts by trajectory and first sample, with their model; a longer horizon goes on where these end.
     """
 
     model: NativeModel
@@ -53,7 +43,7 @@ class Motions:
     exact: bool = False
     order: tuple[int, ...] = ()
     known: dict[tuple[str, int, int, int], Array] = field(default_factory=dict, repr=False)
-    recent: _Recent = field(default_factory=_Recent, repr=False)
+    recent: dict[tuple[int, int], tuple[NativeModel, Array]] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, model: NativeModel, recording: Recording) -> Motions:
@@ -101,7 +91,7 @@ class Motions:
         """Some of them; noise and size stay."""
         states, inputs, t = (tuple(a[k] for k in picks) for a in (self.states, self.inputs, self.t))
         names, order = tuple(self.names[k] for k in picks), tuple(self.order[k] for k in picks)
-        return replace(self, names=names, states=states, inputs=inputs, t=t, order=order, recent=_Recent())
+        return replace(self, names=names, states=states, inputs=inputs, t=t, order=order, recent={})
 
     @cached_property
     def digest(self) -> str:
@@ -124,7 +114,7 @@ class Motions:
         """(n, nx): the measured states, or what the flight from there says; for all hypotheses that fly alike the same."""
         if self.exact:
             return np.stack([self.states[i][s] for i, s, _ in pieces])
-        flight, most = flying(model, self.model), max(1, round(THRESHOLDS.start_lead / self.model.period))
+        flight, most = _flying(model, self.model), max(1, round(THRESHOLDS.start_lead / self.model.period))
         of = flight.digest()
         keys = [(of, self.order[i], s, min(steps, most)) for i, s, steps in pieces]
         new = {key: piece for key, piece in zip(keys, pieces, strict=True) if key not in self.known}
@@ -133,7 +123,7 @@ class Motions:
             u = np.zeros((len(new), most, self.model.nu))
             for k, ((*_, steps), (i, s, _)) in enumerate(new.items()):
                 seen[k, : steps + 1], u[k, :steps] = self.states[i][s : s + steps + 1], self.inputs[i][s : s + steps]
-            self.known.update(zip(new, settled(flight, self.sigma, seen, u), strict=True))
+            self.known.update(zip(new, _settled(flight, self.sigma, seen, u), strict=True))
         return np.stack([self.known[key] for key in keys])
 
     def rolled(
@@ -150,7 +140,7 @@ class Motions:
         out = np.full((len(pieces), int(lengths[0]) + 1, model.nx), np.nan)
         begun = np.zeros(len(pieces), dtype=np.intp)
         for k, (i, s, steps) in enumerate(pieces):
-            part = self.recent.begun(model, (i, s), x[k])[: steps + 1]
+            part = self._begun(model, (i, s), x[k])[: steps + 1]
             out[k, : len(part)], begun[k] = part, len(part) - 1
         legs = {int(q) for q in np.quantile(lengths, np.linspace(0, 1, THRESHOLDS.rollout_legs + 1), method="nearest")} | set(
             begun.tolist()
@@ -167,9 +157,15 @@ class Motions:
             out[rows, done : leg + 1] = model.rollout(out[rows, done], u).x
         for k, (_, _, steps) in enumerate(pieces):
             out[k, steps + 1 :] = np.nan
-        self.recent.model = model if model.backend.engine.forgets else None
-        self.recent.rows = {(i, s): (states, steps) for (i, s, steps), states in zip(pieces, out, strict=True)}
+        self.recent.clear()
+        if model.backend.engine.forgets:
+            self.recent.update({(i, s): (model, a[: steps + 1]) for (i, s, steps), a in zip(pieces, out, strict=True)})
         return pieces, out
+
+    def _begun(self, model: NativeModel, place: tuple[int, int], x: Array) -> Array:
+        """What is known of the rollout of a model from x: at least x."""
+        of, states = self.recent.get(place, (model, x[None]))
+        return states if of is model and states[0].tobytes() == x.tobytes() else x[None]
 
     def errors(self, model: NativeModel, horizon: float) -> Array:
         """(trajectories, groups, 3): mean square and mean of the error over time; mean over pieces of ½ ln(σ² + their e²)."""
@@ -255,6 +251,64 @@ def sensitivity(motions: Motions, model: NativeModel, changes: Mapping[str, Nati
         d = np.concatenate([difference(g.specs, moved[..., c], base[..., c]) for g, c in both], axis=-1)
         out[name] = np.clip(np.nan_to_num(d / weights), -10, 10).ravel()
     return out
+
+
+def _flying(model: NativeModel, stated: NativeModel) -> NativeModel:
+    """The model with the contacts of the stated one: what differs in contacts alone has one and the same flight."""
+    return model.restated({p.name: p.value for p in stated.parameters if p.name in CONTACT})
+
+
+def _settled(model: NativeModel, sigma: Array, seen: Array, u: Array) -> Array:
+    """Starts (n, nx) of motions seen (n, T, nx), NaN beyond their ends, under u (n, T − 1, nu); sigma (G,): noise floors.
+
+    A velocity from a filter is late, and one from a single sample is noisy. While a body flies, a wrong start shows in its
+    place as an error that grows evenly: a line through the differences from the model's rollout is the error of the start,
+    weighed against the velocity that was measured. As many samples count as tell the slope best, by their own misfit: an impact
+    spoils it. Where a rollout with other contacts goes another way, or where no line fits, the start is the measured one.
+    """
+    groups = {g.output.name: (g, float(s)) for g, s in zip(model.groups, sigma, strict=True)}
+    pairs = [(groups[a], groups[b]) for a, b in _PAIRS if a in groups and b in groups]
+    start = seen[:, 0].copy()
+    if not pairs:
+        return start
+    other = {p.name: values[0] for p in model.parameters if p.name in CONTACT and (values := tried(p))}
+    rolled, touched = (m.rollout(start, u).x for m in (model, model.restated(other)))
+    aloft = np.all([g.error(rolled, touched) <= THRESHOLDS.same_flight * s for g, s in groups.values()], axis=0)
+    aloft = np.logical_and.accumulate(aloft, axis=1)
+    now, moved = model.turned(start, back=False), np.zeros(len(start), dtype=bool)
+    for (place, noise), (speed, spread) in pairs:
+        columns = list(place.columns)
+        with np.errstate(invalid="ignore"):
+            off = difference(place.specs, seen[..., columns], rolled[..., columns])
+        off[~aloft] = np.nan
+        offset, slope = (noise * a for a in _line(model.period, off / noise, noise / spread))
+        now[:, columns] = rotated(now[:, columns], offset) if place.specs[0].kind == "quaternion" else now[:, columns] + offset
+        now[:, list(speed.columns)] += slope
+        moved |= (offset != 0).any(axis=1)
+    start[moved] = model.turned(now[moved], back=True)
+    return start
+
+
+def _line(period: float, off: Array, ratio: float) -> tuple[Array, Array]:
+    """Offset and slope (n, 3) of the line with which each row of `off` (n, T, 3) begins, in noise floors; 0 where none does.
+
+    1 / ratio: noise of the slope that was measured, which is 0.
+    """
+    t = period * np.arange(off.shape[1])
+    n, t1, t2 = (np.cumsum(a)[:, None] for a in (np.ones_like(t), t, t**2))
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        y0, y1 = np.cumsum(off, axis=1), np.cumsum(t[:, None] * off, axis=1)
+        wide = np.maximum(t2 - t1**2 / n, 1e-300)
+        slope = (y1 - t1 / n * y0) / wide
+        square = np.cumsum(off**2, axis=1) - y0**2 / n - wide * slope**2
+        misfit = np.sum(square, axis=-1) / np.maximum(n[:, 0] - 2, 1)
+        variance = np.maximum(misfit, 1.0) / wide[:, 0]
+    variance[:, : THRESHOLDS.line_samples - 1] = np.inf
+    variance[~(misfit <= THRESHOLDS.line_misfit**2)] = np.inf
+    rows, best = np.arange(len(off)), np.argmin(variance, axis=1)
+    found = np.isfinite(variance[rows, best])[:, None]
+    b = np.where(found, slope[rows, best] / (1 + variance[rows, best] * ratio**2)[:, None], 0.0)
+    return np.where(found, (y0[rows, best] - t1[best] * b) / n[best], 0.0), b
 
 
 def _width(group: Group) -> int:

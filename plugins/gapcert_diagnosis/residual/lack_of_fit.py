@@ -54,7 +54,7 @@ def lack(long: Tangent, short: Tangent, seed: int = 0) -> Lack | None:
     """None where no score stands out; short: shows the colour of the noise."""
     gone, shared = _absorbed(long), input_features(long)
     r = _without(gone, long.project(long.residual).reshape(1, -1))
-    against = np.concatenate([long.free, *(a.reshape(*long.residual.shape, -1) for a in (gone, r.T))], axis=2)
+    against = np.concatenate([long.linear.free, *(a.reshape(*long.residual.shape, -1) for a in (gone, r.T))], axis=2)
     weighed = long.linear.adjoint(against)
     drawn = functools.cache(lambda: [_without(gone, n.reshape(len(n), -1)) for n in noise(long, short, seed)])
     best, clearly = Lack("", "", THRESHOLDS.lack_sigmas), attrgetter("sigmas")
@@ -134,7 +134,7 @@ class _Forces:
         with np.errstate(all="ignore"):
             felt = np.swapaxes(B, 2, 3) @ own
             step = np.block([[motion.linear.A, B], [felt @ motion.linear.A, felt @ B / 2]])
-            return cls(step, (np.swapaxes(rows, 2, 3) @ B)[..., 0], motion.free.shape[2])
+            return cls(step, (np.swapaxes(rows, 2, 3) @ B)[..., 0], motion.linear.free.shape[2])
 
     def columns(self, force: Array) -> _Columns | None:
         """Of forces (W, S, K); None where starts make so nearly all of a column that the rest is lost in its square."""
@@ -186,7 +186,7 @@ def _rare(total: float, k: float) -> float:
 
 def _absorbed(motion: Tangent) -> Array:
     """An orthonormal basis (W·L·ny, k) of what the fitted numbers make, with the starts free to follow."""
-    rows = motion.project(slopes(motion.fitted, motion.windows)).reshape(motion.residual.size, -1)
+    rows = motion.project(slopes(motion.fitted)).reshape(motion.residual.size, -1)
     if not rows.shape[1]:
         return rows
     u, size, _ = np.linalg.svd(rows / (np.linalg.norm(rows, axis=0) + 1e-300), full_matrices=False)

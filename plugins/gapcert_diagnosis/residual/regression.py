@@ -209,15 +209,15 @@ class Term:
 
 
 def _terms(motion: Tangent, site: str) -> list[Term]:
+    def powers(dimension: str, z: str, values: Array) -> list[Term]:
+        found = ((1, z, values), (2, f"{z}*abs({z})", values * np.abs(values)), (3, f"{z}**3", values**3))
+        return [Term("{c}*" + text, {"force": 1, dimension: -n}, power) for n, text, power in found]
+
     q, v = motion.place(site)
     speed = motion.x[..., v]
     brisk = float(np.sqrt(np.mean(speed**2))) or 1.0
-    out = [Term("{c}", {"force": 1}, np.ones_like(speed))]
-    powers = ((1, "{z}"), (2, "{z}*abs({z})"), (3, "{z}**3"))
-    named = [("velocity", "{v}", speed)] + ([("position", "{q}", motion.x[..., q])] if q is not None else [])
-    for kind, name, z in named:
-        values = {1: z, 2: z * np.abs(z), 3: z**3}
-        out += [Term("{c}*" + t.replace("{z}", name), {"force": 1, kind: -n}, values[n]) for n, t in powers]
+    out = [Term("{c}", {"force": 1}, np.ones_like(speed)), *powers("velocity", "{v}", speed)]
+    out += [] if q is None else powers("position", "{q}", motion.x[..., q])
     out += [
         Term("{c}*tanh({v}/{s})", {"force": 1}, np.tanh(speed / s), s, {"velocity": 1}) for s in (0.02 * brisk, 0.2 * brisk)
     ]
@@ -227,9 +227,7 @@ def _terms(motion: Tangent, site: str) -> list[Term]:
             wave = {"sin": np.sin(k * place), "cos": np.cos(k * place)}
             out += [Term(f"{{c}}*{f}({{s}}*{{q}})", {"force": 1}, w, float(k), {"position": -1}) for f, w in wave.items()]
     for i, spec in enumerate(motion.model.inputs):
-        drive = motion.u[..., i]
-        values = {1: drive, 2: drive * np.abs(drive), 3: drive**3}
-        out += [Term("{c}*" + t.replace("{z}", spec.name), {"force": 1, spec.name: -n}, values[n]) for n, t in powers]
+        out += powers(spec.name, spec.name, motion.u[..., i])
     return out
 
 

@@ -23,9 +23,8 @@ class Growth:
     """How much more is left in long windows than stationary noise with the colour of short ones would leave there.
 
     A missing force adds up over a window; noise, coloured or not, does not. chi_long, chi_short: mean squares in units of the
-    white noise floor; growth = chi_long/max(chi_short, 1); beyond (ny,): measured over predicted mean square of the long
-    windows; sigmas: of the largest log(beyond), in standard deviations of that noise; excess (ny,): the part of the mean square
-    that the noise does not explain.
+    white noise floor; beyond (ny,): measured over predicted mean square of the long windows; sigmas: of the largest
+    log(beyond), in standard deviations of that noise; excess (ny,): the part of the mean square that noise does not explain.
     """
 
     chi_long: float
@@ -33,10 +32,6 @@ class Growth:
     beyond: Array
     sigmas: float
     excess: Array
-
-    @property
-    def growth(self) -> float:
-        return self.chi_long / max(self.chi_short, 1.0)
 
 
 def growth(long: Tangent, short: Tangent, seed: int = 0) -> Growth:
@@ -155,7 +150,7 @@ def _squares(rows: Array) -> Array:
 def _sums(motion: Tangent, lags: int) -> Array:
     """Expected lagged sums of P ε per unit of each noise: P Γ P = Γ − QQᵀΓ − ΓQQᵀ + Q(QᵀΓQ)Qᵀ, (lags + 1, ny, ny, J)."""
     w, length, ny = motion.windows.y.shape
-    basis = motion.free.reshape(w, length, ny, -1).transpose(2, 0, 3, 1)
+    basis = motion.linear.free.reshape(w, length, ny, -1).transpose(2, 0, 3, 1)
     gap = np.abs(np.subtract.outer(np.arange(length), np.arange(length)))
     covers, kinds = [colour**gap for colour in THRESHOLDS.noise_colours], len(THRESHOLDS.noise_colours)
     out, square = np.zeros((lags + 1, ny, kinds * ny)), np.zeros((ny, length, length))
@@ -212,7 +207,7 @@ class _Logged:
     @classmethod
     def of(cls, motion: Tangent) -> _Logged:
         w, length, ny = motion.windows.y.shape
-        free = motion.free.reshape(w, length, ny, -1).transpose(0, 2, 1, 3)
+        free = motion.linear.free.reshape(w, length, ny, -1).transpose(0, 2, 1, 3)
         return cls(w, length, free.reshape(w, ny * length, -1))
 
     def residual(self, logs: Array) -> Array:

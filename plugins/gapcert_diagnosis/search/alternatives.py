@@ -8,17 +8,16 @@ from typing import final
 
 import numpy as np
 
-from gapcert.plugin import EffectParameter
 from gapcert_diagnosis.data.dataset import Dataset, Windows
 from gapcert_diagnosis.fitting.fit import Fit
 from gapcert_diagnosis.results import Seen
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Candidate, Causes, Library
-from .criterion import Found, fails, keys, rank, richer, values, without
+from .criterion import Found, fails, keys, rank, richer, without
 from .fitted_sets import FittedSets
 from .moves import additions, spared
-from .validation import judge
+from .stepwise import judge
 
 
 @final
@@ -43,13 +42,9 @@ class Answer:
         return self.search.library
 
     @property
-    def windows(self) -> Windows:
-        return self.search.windows
-
-    @property
     def dataset(self) -> Dataset:
         """Of the windows, with the input held as fits best."""
-        return self.search.windows.measured
+        return self.fit.windows.measured
 
     @property
     def nothing(self) -> Fit:
@@ -162,23 +157,19 @@ def _implausible(library: Library, c: Candidate, fitted: Fit) -> dict[str, tuple
     stated = None if (freed := library.freed(c)) is None else freed.value
     if stated == 0:
         return {}
-    known, scales = values(fitted), library.scales(c)
-    limits = {n: (p.plausible[0] * p.scale(scales), p.plausible[1] * p.scale(scales)) for p, n in _numbers(library, c)}
+    known, scales = fitted.values, library.scales(c)
+    limits = {n: (p.plausible[0] * p.scale(scales), p.plausible[1] * p.scale(scales)) for n, p in library.parameters(c).items()}
     if stated is not None and stated < 0:
         limits = {n: (-high, -low) for n, (low, high) in limits.items()}
     return {n: ends for n, ends in limits.items() if not ends[0] <= known[n] <= ends[1]}
 
 
-def _numbers(library: Library, c: Candidate) -> list[tuple[EffectParameter, str]]:
-    return list(zip(c.effect.parameters, library.names(c), strict=True))
-
-
 def flags(library: Library, c: Candidate, fitted: Fit) -> tuple[str, ...]:
     """Sentences about numbers that are not plausible, or that lie at the edge of what was tried."""
-    known, out = values(fitted), []
+    known, out = fitted.values, []
     low, high = library.bounds(c)
     implausible = _implausible(library, c, fitted)
-    for i, ((p, name), off) in enumerate(zip(_numbers(library, c), library.off(c), strict=True)):
+    for i, ((name, p), off) in enumerate(zip(library.parameters(c).items(), library.off(c), strict=True)):
         value, unit = known[name], f" {library.units(c)[i]}".removesuffix(" 1")
         if name in implausible:
             least, most = implausible[name]
@@ -198,7 +189,7 @@ def smallest(search: FittedSets) -> tuple[Seen, ...]:
     library, out = search.library, []
     (table,) = search.screen.tables([(search.nothing, 1)])
     for c in library.candidates:
-        (low, high), row = library.bounds(c), table.least(c, library.threshold)
+        (low, high), row = library.bounds(c), table.least(c, library.charge())
         if row is not None and (row >= low).all() and (row <= high).all():
             out.append(Seen(*c.key, c.effect.parameters[0].name, float(row[0]), library.units(c)[0]))
     return tuple(out)

@@ -4,26 +4,17 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypeVar, final
+from typing import final
 
 import numpy as np
 
-from gapcert.plugin import (
-    Array,
-    Effect,
-    EffectParameter,
-    Extension,
-    Model,
-    Parameter,
-    difference,
-    position,
-    site_units,
-)
-from gapcert_diagnosis.data.dataset import Dataset
-from gapcert_diagnosis.fitting.fit import Hypothesis
+from gapcert.plugin import Array, Effect, EffectParameter, Extension, Model, Parameter, difference, position
+from gapcert_diagnosis.data.dataset import Dataset, once
+from gapcert_diagnosis.fitting.hypothesis import Hypothesis
+from gapcert_diagnosis.fitting.linearised import sliding, velocity
 from gapcert_diagnosis.fitting.step_size import built
 from gapcert_diagnosis.results import ORDER
 from gapcert_diagnosis.thresholds import THRESHOLDS
@@ -45,15 +36,6 @@ class Candidate:
 
 
 Causes = tuple[Candidate, ...]
-K = TypeVar("K")
-V = TypeVar("V")
-
-
-def once(known: dict[K, V], key: K, make: Callable[[], V]) -> V:
-    """What is kept under a key, made the first time."""
-    if key not in known:
-        known[key] = make()
-    return known[key]
 
 
 @final
@@ -94,7 +76,7 @@ class Library:
         channel = [s.name for s in self.measured.channels].index(c.site)
         values, weights = (np.concatenate(a)[:, channel] for a in (self.measured.outputs, self.measured.weights))
         found = c.effect.seen_in(values[weights > 0])
-        return None if found is None else dict(zip(self.names(c), (found[p.name] for p in c.effect.parameters), strict=True))
+        return None if found is None else {n: found[p.name] for n, p in self.parameters(c).items()}
 
     def _roughened(self, c: Candidate, found: Mapping[str, float]) -> Dataset:
         """With a noise floor of at least what the effect does to its channel over the range of the motion."""
@@ -110,13 +92,8 @@ class Library:
         groups = [tuple(g) for _, g in itertools.groupby(self.candidates, key=lambda c: c.effect.name)]
         return [g for g in groups if len(g) > 1 and g[0].effect.site in ("coordinate", "input")]
 
-    @property
-    def threshold(self) -> float:
-        """The fall in score that a cause must bring."""
-        return self.charge()
-
     def charge(self, settings: int = 0) -> float:
-        """The same for one that was chosen among so many settings as well: more rivals tried, more needed."""
+        """The fall in score that a cause must bring, chosen among so many settings as well: more rivals tried, more needed."""
         return 12 + 2 * math.log(max(1, len(self.candidates) + settings))
 
     def extension(self, c: Candidate) -> Extension:
@@ -193,6 +170,10 @@ class Library:
         """What a candidate's parameters are called in the extended model."""
         return tuple(p.name for p in self._numbers(c))
 
+    def parameters(self, c: Candidate) -> dict[str, EffectParameter]:
+        """By these names, the parameters of the effect."""
+        return dict(zip(self.names(c), c.effect.parameters, strict=True))
+
     def units(self, c: Candidate) -> tuple[str, ...]:
         return tuple(p.unit for p in self._numbers(c))
 
@@ -248,7 +229,7 @@ class Library:
                 step = THRESHOLDS.nuisance_step * (stated.tolerance if doubt is None else THRESHOLDS.doubt_starts[-1] * doubt)
                 rows.append((stated.name, stated.value, low[0], high[0], step, math.inf))
                 continue
-            for i, (name, e) in enumerate(zip(self.names(c), c.effect.parameters, strict=True)):
+            for i, (name, e) in enumerate(self.parameters(c).items()):
                 rows.append((name, e.off, low[i], high[i], _step(e, e.scale(self.scales(c))), math.inf))
         names = tuple(r[0] for r in rows)
         return Hypothesis(model, names, *np.array([r[1:] for r in rows], dtype=np.float64).reshape(-1, 5).T)
@@ -301,36 +282,6 @@ def _restated(model: Model, values: Mapping[str, float]) -> Model:
     spec = model.to_spec()
     stated, units = spec["parameters"], {p.name: p.unit for p in model.parameters}
     return built(spec | {"parameters": stated | {n: {**stated[n], "value": f"{v!r} {units[n]}"} for n, v in values.items()}})
-
-
-def sliding(model: Model, site: str, x: Array, u: Array, plain: Array | None = None) -> Array:
-    """∂x⁺/∂f (n, nx) of the machine as it slides: what turns a change of the state into a force, also where friction holds."""
-    spec = model.to_spec()
-    if spec.get("dry_friction"):
-        return probe(built({**spec, "dry_friction": {}}), site, x, u)
-    return probe(model, site, x, u, plain)
-
-
-def probe(model: Model, site: str, x: Array, u: Array, plain: Array | None = None) -> Array:
-    """∂x⁺/∂f (n, nx) for a force f at a coordinate, held for one period; plain: x⁺ without it, where that is known."""
-    if "forces" in model.capabilities:
-        forces = np.zeros((len(x), model.substeps, len(model.coordinates)))
-        forces[..., model.coordinates.index(site)] = 1.0
-        plain = model.step(x, u).x if plain is None else plain
-        return difference(model.states, model.step(x, u, forces=forces).x, plain)
-    force = Parameter("probe_force", 0.0, site_units(model, "coordinate", site)["force"])
-    pushed = model.extend([Extension("probe", site, (force,), force=force.name)])
-    on, off = (pushed.step(x, u, parameters={"probe_force": f}).x for f in (1.0, 0.0))
-    return difference(model.states, on, off)
-
-
-def velocity(model: Model, site: str, response: Array) -> int:
-    """The column of the state that a force at `site` changes first: its velocity, or the state whose equation the site is."""
-    names = [s.name for s in model.states]
-    for name in (f"{site}_dot", site):
-        if name in names:
-            return names.index(name)
-    return int(np.argmax(np.abs(response).max(axis=0)))
 
 
 def _scales(library: Library, c: Candidate, x: Array, u: Array) -> dict[str, float]:

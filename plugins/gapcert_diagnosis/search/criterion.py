@@ -17,20 +17,20 @@ squared residual of a channel over that of noise, G the charge for one more caus
 | `setting_pays` | a fit under another setting      | χ falls by `setting_share`, ΔS > charge               | settings       |
 
 Where a search is cautious and the closer of two fits is rough, ΔS is at most z², `rough_charge` stands for G, and
-`sure_errors`² or `spared_score` for `richer_score`. `effect_size` says which causes are too small to be named, and
+`sure_errors`² or `spared_score` for `richer_score`. `FittedSets.small` says which causes are too small to be named, and
 `native.stepwise` what pays for an engine.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
 
 from gapcert.plugin import Array
-from gapcert_diagnosis.fitting.fit import Fit, Hypothesis
+from gapcert_diagnosis.fitting.fit import Fit
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Causes, Library
@@ -192,16 +192,6 @@ def rough_charge(library: Library, causes: Causes, before: Causes) -> float:
     if {richer.get(n, simpler.get(n, n)) for n in names} != known:
         return math.inf
     return THRESHOLDS.number_score + (THRESHOLDS.sure_errors**2 if richer else 0.0)
-
-
-def values(fitted: Fit) -> dict[str, float]:
-    """Fitted numbers by name."""
-    return dict(zip(fitted.hypothesis.names, map(float, fitted.theta), strict=True))
-
-
-def numbers(h: Hypothesis, known: Mapping[str, float]) -> Array:
-    """Numbers (p,) of a hypothesis: those that are known, and the others as they are stated."""
-    return np.array([known.get(n, v) for n, v in zip(h.names, h.value.tolist(), strict=True)])
 
 
 def keys(causes: Causes) -> Keys:

@@ -12,15 +12,15 @@ from typing import final
 import numpy as np
 
 from gapcert.plugin import Effect, Model, UsageError, Variant
-from gapcert_diagnosis.data.dataset import Windows
+from gapcert_diagnosis.data.dataset import Windows, once
 from gapcert_diagnosis.fitting.fit import Fit, fit, stepped
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
-from .candidates import Causes, Library, once
-from .criterion import Found, better, noise, numbers, setting_pays, values, without
+from .candidates import Causes, Library
+from .criterion import Found, better, noise, setting_pays, without
 from .fitted_sets import FittedSets
 from .moves import additions
-from .validation import confirms, search_windows
+from .stepwise import confirms, search_windows
 
 Tried = tuple[Variant, Causes, Fit]
 Numbers = dict[str, float]
@@ -48,7 +48,7 @@ class Settled:
 
 
 def across(library: Library, effects: Sequence[Effect], windows: Windows, tell: Callable[..., None]) -> Settled:
-    """The search of `validation.search_windows`, and again under settings with which the score is better.
+    """The search of `stepwise.search_windows`, and again under settings with which the score is better.
 
     A setting has no number, but was chosen among as many as there are: it pays as a cause does, unless it takes the place of
     causes, which pay for their numbers already.
@@ -99,7 +99,7 @@ class _Settings:
             # Beside a setting a simpler law may do: two numbers that are one, say.
             likely = [f for e in exact for f in _simpler(sets, e)]
         for causes, now in likely if all(f.chi.max() >= THRESHOLDS.quiet for _, f in likely) else ():
-            tried = self.rank(variants, causes, values(now))
+            tried = self.rank(variants, causes, now.values)
             if (setting := self.whole(tried, now)) is not None:
                 return Settled(*self.under(setting.variant), (setting,))
         return None
@@ -109,7 +109,7 @@ class _Settings:
         for variant, causes, first in tried[:1]:
             if not self.library.measured.exact and first.chi.max() > THRESHOLDS.plain_residual:
                 return None
-            found = self.fitted(variant.model, causes, self.earlier, values(first))
+            found = self.fitted(variant.model, causes, self.earlier, first.values)
             if found.chi.max() < THRESHOLDS.quiet and self.pays(found, before, self.library.charge(len(tried)), fewer=False):
                 return _setting(self.library, tried, variant)
         return None
@@ -124,7 +124,7 @@ class _Settings:
         Without noise any may decide. Else one counts that the windows feel, or that does nothing before a cause is there; in
         the place of a cause, about as much as they feel the cause.
         """
-        (causes, now), exact, start = found, self.library.measured.exact, values(found[1])
+        (causes, now), exact, start = found, self.library.measured.exact, found[1].values
         felt, size = [(v, 0.0) for v, _, _ in alone], 0.0
         if not exact:
             near = self.near([v for v, _ in felt], (), {})
@@ -176,7 +176,7 @@ class _Settings:
         base = self.fitted(self.library.model, causes, self.few, start)
         under = [(v, self.bare(v.model).hypothesis(causes)) for v in variants]
         alike = [(v, h) for v, h in under if h.names == base.hypothesis.names]
-        own, *fits = stepped(base, self.few, [base.hypothesis, *(h for _, h in alike)])
+        own, *fits = stepped(base, [base.hypothesis, *(h for _, h in alike)])
         found = [(v, f, own or base) for (v, _), f in zip(alike, fits, strict=True) if f is not None]
         # A setting that takes numbers away, or brings some, has no slopes in common.
         others = [self.fit_under(v, causes, start) for v, h in under if h.names != base.hypothesis.names]
@@ -195,7 +195,7 @@ class _Settings:
     def fitted(self, model: Model, causes: Causes, windows: Windows, start: Numbers) -> Fit:
         key = id(model), id(windows), tuple(c.key for c in causes), tuple(sorted(start.items()))
         h = self.bare(model).hypothesis(causes)
-        return once(self._fits, key, lambda: fit(h, windows, theta=numbers(h, start), iterations=THRESHOLDS.second_fit))
+        return once(self._fits, key, lambda: fit(h, windows, theta=h.theta(start), iterations=THRESHOLDS.second_fit))
 
     def pays(self, new: Fit, old: Fit, charge: float, *, fewer: bool) -> bool:
         """In place of causes only the choice is charged; beside them it pays for itself, on the later windows as well."""
@@ -207,7 +207,7 @@ class _Settings:
         best: Settled | None = None
         for tried in self.groups(alone, settled.found):
             for variant, some, first in tried[: THRESHOLDS.setting_finalists]:
-                whole = self.fitted(variant.model, some, self.earlier, values(first))
+                whole = self.fitted(variant.model, some, self.earlier, first.values)
                 if not self.pays(whole, now, charge, fewer=len(some) < len(causes)):
                     continue
                 search, again = self.under(variant)

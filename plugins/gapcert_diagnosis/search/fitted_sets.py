@@ -7,14 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import final
 
-from gapcert_diagnosis.data.dataset import Windows
-from gapcert_diagnosis.fitting.fit import Fit, carried, fit
-from gapcert_diagnosis.fitting.restarts import rescued
+from gapcert_diagnosis.data.dataset import Windows, once
+from gapcert_diagnosis.fitting.fit import Fit, carried, fit, rescued
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
-from .candidates import Candidate, Causes, Library, once
-from .criterion import Found, Keys, better, decides, keys, named, noise, numbers, pays, rough_charge, values
-from .effect_size import negligible
+from .candidates import Candidate, Causes, Library
+from .criterion import Found, Keys, better, decides, keys, named, noise, pays, rough_charge
 from .gains import Promise
 from .screening import Screen, standing_in
 
@@ -47,7 +45,7 @@ class FittedSets:
         self.cautious = False
         self.lost: set[Keys] = set()
         self.negligible: dict[tuple[str, str], float] = {}
-        self.nothing = self.fit((), None) if plain is None else self._keep((), rescued(plain, windows))
+        self.nothing = self.fit((), None) if plain is None else self._keep((), plain)
 
     @cached_property
     def screen(self) -> Screen:
@@ -78,26 +76,26 @@ class FittedSets:
 
     def fit_again(self, causes: Causes, base: Found | None, start: Mapping[str, float] | None = None) -> Fit:
         """A fit from other first values; the better one is kept."""
-        h, known = self.library.hypothesis(causes), {} if base is None else values(base[1])
+        h, known = self.library.hypothesis(causes), {} if base is None else base[1].values
         if base is not None and start is None:
             start = self._first(causes, base)
         fewer = base is not None and keys(causes) < keys(base[0]) and len(base[1].start) == len(self.windows)
-        theta = numbers(h, {**known, **(start or {})})
-        new = fit(h, self.windows, theta=theta, start=base[1].start if base and fewer else None)
-        return self._keep(causes, rescued(new, self.windows))
+        theta = h.theta({**known, **(start or {})})
+        return self._keep(causes, fit(h, self.windows, theta=theta, start=base[1].start if base and fewer else None))
 
     def fit_from(self, causes: Causes, other: Fit) -> Fit:
         """The fit of a set from its numbers on other windows; starts that are not known from there follow these first."""
         if keys(causes) not in self._fits:
             h = self.library.hypothesis(causes)
-            theta = numbers(h, values(other))
+            theta = h.theta(other.values)
             closest = min((f for _, f in self._fits.values()), key=lambda f: float(f.chi.sum()))
             start = carried(h, theta, other, self.windows, closest.start)
-            self._keep(causes, rescued(fit(h, self.windows, theta=theta, start=start), self.windows))
+            self._keep(causes, fit(h, self.windows, theta=theta, start=start))
         return self._fits[keys(causes)][1]
 
-    def _keep(self, causes: Causes, new: Fit) -> Fit:
-        old = self.known(causes)
+    def _keep(self, causes: Causes, made: Fit) -> Fit:
+        """The better one of what was known, and of this once its lost windows are led back."""
+        new, old = rescued(made), self.known(causes)
         if old is None or self.better(new, old) > 0:
             self._fits[keys(causes)] = causes, new
         return self._fits[keys(causes)][1]
@@ -106,7 +104,7 @@ class FittedSets:
         """The best of a fit and of fresh ones from nearby: sticking puts kinks into the cost, and a fit may catch on one."""
         best, dry = self.fit(causes, base), self.library.dry(causes)
         for factor in THRESHOLDS.shakes if dry and not noise(best) else ():
-            shaken = {n: v * factor if n in dry else v for n, v in values(best).items()}
+            shaken = {n: v * factor if n in dry else v for n, v in best.values.items()}
             self.fit_again(causes, None, shaken)
         return self._fits[keys(causes)][1]
 
@@ -122,7 +120,7 @@ class FittedSets:
     def try_move(self, base: Found, s: Promise, iterations: int = THRESHOLDS.first_fit) -> Fit:
         """A set with a move more, fitted to the short windows from what is promised."""
         h, brief = self.library.hypothesis((*base[0], *s.move)), self.brief(base)
-        theta = numbers(h, values(brief) | dict(s.values))
+        theta = h.theta(brief.values | dict(s.values))
         return fit(h, self.short, theta=theta, start=brief.start, iterations=iterations)
 
     def fit_further(self, first: Fit, iterations: int = THRESHOLDS.second_fit) -> Fit:
@@ -164,10 +162,8 @@ class FittedSets:
 
     def carry(self, old: Candidate, new: Candidate, found: Found, default: bool = True) -> dict[str, float]:
         """First values of one law from those of another that it contains, or that contains it."""
-        fitted = values(found[1])
-        mine, theirs = (
-            dict(zip((p.name for p in c.effect.parameters), self.library.names(c), strict=True)) for c in (new, old)
-        )
+        fitted = found[1].values
+        mine, theirs = ({p.name: n for n, p in self.library.parameters(c).items()} for c in (new, old))
         out: dict[str, float] = self._first((new,), ((), self.nothing)) if default else {}
         for m, t in new.effect.contains.get(old.effect.name, {}).items():
             out[mine[m]] = fitted[theirs[t]]
@@ -183,11 +179,14 @@ class FittedSets:
 
     def charges(self, found: Found, before: Found) -> tuple[float, float | None]:
         """What a larger set must bring: where samples are counted, and where a cautious search finds both fits rough."""
-        return self.library.threshold, rough_charge(self.library, found[0], before[0]) if self.cautious else None
+        return self.library.charge(), rough_charge(self.library, found[0], before[0]) if self.cautious else None
 
     def small(self, found: Found) -> dict[tuple[str, str], float]:
         """(effect, site) → share of the effort of causes that are too small to be named."""
-        return {(effect, site): share for effect, site, share in negligible(self.screen, found[0], values(found[1]))}
+        known = found[1].values
+        shares = {c.key: self.screen.share(c, known) for c in found[0]}
+        least = {c.key: THRESHOLDS.least_output if c.effect.site == "output" else THRESHOLDS.least_effort for c in found[0]}
+        return {key: share for key, share in shares.items() if share < least[key]}
 
     def matters(self, found: Found) -> bool:
         """Is every cause larger than what an integrator may leave, or than a stated tolerance? What is not, is noted.

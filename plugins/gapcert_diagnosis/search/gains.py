@@ -1,4 +1,5 @@
-"""What candidates promise for one fit: their pushes as columns beside what is free already, and the gains of those columns."""
+"""What candidates promise for one fit: their pushes as columns beside what is free already, and the gains of those columns,
+each for itself, in pairs, or taken one after another."""
 
 from __future__ import annotations
 
@@ -14,12 +15,13 @@ import numpy.typing as npt
 from gapcert.plugin import Array
 from gapcert_diagnosis.data.dataset import Windows, flat
 from gapcert_diagnosis.fitting.fit import Fit
+from gapcert_diagnosis.fitting.gauss_newton import bounded
 from gapcert_diagnosis.fitting.linearised import LinearisedMotion, Motion, shortened
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Candidate, Causes, Library
-from .matching_pursuit import Columns, MatchingPursuit, Rows
 
+Rows = npt.NDArray[np.intp]
 AT_ONCE = 200  # columns that are pushed along the path together, or little more
 
 
@@ -177,10 +179,10 @@ class GainTable:
         """Of all that has been entered, nothing taken yet."""
         count = sum(len(c.gain) for c in self.columns.values())
         if self._empty is None or len(self._empty.open) != count:
-            self._empty = MatchingPursuit(self.library, self._all(), self.slopes, self.inverse, self.along, self.residual)
+            self._empty = MatchingPursuit(self)
         return copy.copy(self._empty)
 
-    def _all(self) -> Columns:
+    def all_columns(self) -> Columns:
         entered = [c for c in self.library.candidates if c.key in self.columns and len(self.columns[c.key].gain)]
         known = sorted(entered, key=lambda c: c.key)
         columns = [self.columns[c.key] for c in known]
@@ -196,7 +198,7 @@ class GainTable:
 
         Greedy steps miss two laws neither of which helps much without the other.
         """
-        e = self._all()
+        e = self.all_columns()
         known, owner, inner, rows, seen, limits = e.known, e.owner, e.inner, e.rows, e.seen, e.limits
         if len(known) < 2:
             return []
@@ -271,15 +273,8 @@ class GainTable:
         low, high = np.array([self._bounds(k, c.values[i]) for k, (c, i) in zip(move, columns, strict=True)]).T
         rows, seen = (np.stack([getattr(c, n)[:, i] for c, i in columns], axis=-1) for n in ("rows", "seen"))
         curve, slope = self._normal_equations(rows, seen)
-        a, free = np.zeros(len(low)), np.diag(curve) > 1e-9
-        for _ in range(len(a)):
-            rest = slope - curve[:, ~free] @ a[~free]
-            a[free] = np.linalg.lstsq(curve[np.ix_(free, free)], rest[free], rcond=None)[0]
-            out = free & ((a < low) | (a > high))
-            if not out.any():
-                break
-            a[out] = np.clip(a, low, high)[out]
-            free = free & ~out
+        a, usable = np.zeros(len(low)), np.diag(curve) > 1e-9
+        a[usable] = bounded(curve[np.ix_(usable, usable)], slope[usable], low[usable], high[usable])
         return float(2 * a @ slope - a @ curve @ a), a
 
     def _freed(self, c: Candidate) -> Promise | None:
@@ -307,6 +302,73 @@ class GainTable:
             return steps
         rows = [steps[:, i * self.whole : i * self.whole + self.steps] for i in range(self.parts)]
         return np.stack(rows, axis=1).reshape(len(steps) * self.parts, *rows[0].shape[1:])
+
+
+@final
+@dataclass(frozen=True)
+class Columns:
+    """Candidates that push; of every column whose it is, which of its starts, its rows (N, K), what starts see, its bounds."""
+
+    known: Sequence[Candidate]
+    owner: Rows
+    inner: Rows
+    rows: Array
+    seen: Array
+    limits: Array
+
+    def of(self, c: Candidate) -> npt.NDArray[np.bool_]:
+        """Which columns (K,) are those of a candidate."""
+        return np.asarray(np.array([k.key == c.key for k in self.known], dtype=bool)[self.owner])
+
+
+@final
+class MatchingPursuit:
+    """Orthogonal matching pursuit.
+
+    With curvature c, slope s and i the column that is taken, c − cᵢᵢ⁻¹ cᵢcᵢᵀ and s − cᵢᵢ⁻¹ sᵢcᵢ are left.
+    """
+
+    def __init__(self, table: GainTable) -> None:
+        """Of all that has been entered into a table."""
+        self.library, self.columns = table.library, table.all_columns()
+        rows, seen = self.columns.rows, self.columns.seen
+        self.cross = rows.T @ table.slopes
+        self.pulled = self.cross @ table.inverse
+        self.slope = self.pulled @ table.along - (rows.T @ table.residual)[:, 0]
+        own = np.einsum("ij,ij->j", rows, rows) - np.einsum("ij,ij->j", seen, seen)
+        self.curve = own - np.einsum("ij,ij->i", self.pulled, self.cross)
+        self.least = np.maximum((1 - THRESHOLDS.alike_columns**2) * self.curve, 1e-9)
+        self.open = np.ones(len(self.curve), dtype=bool)
+        self.picks: list[int] = []
+        self._gone: list[Array] = []
+
+    def gains(self) -> Array:
+        """What each column (K,) promises beside those that are taken: nothing, if it is alike or at odds with one of them."""
+        usable, limits = self.open & (self.curve > self.least), self.columns.limits
+        a = np.divide(self.slope, self.curve, out=np.zeros_like(self.slope), where=usable)
+        a = np.clip(a, limits[:, 0], limits[:, 1])
+        return np.where(usable, 2 * a * self.slope - a**2 * self.curve, 0.0)
+
+    def best(self) -> int | None:
+        """The column that promises most; of laws that contain one another the simplest that promises nearly as much."""
+        gains, known, owner = self.gains(), self.columns.known, self.columns.owner
+        if gains.max(initial=0.0) <= 0:
+            return None
+        i = int(np.argmax(gains))
+        inside = [o for o, c in enumerate(known) if self.library.within(c, known[int(owner[i])])]
+        kin = np.flatnonzero(np.isin(owner, inside) & (gains > THRESHOLDS.even_promise * gains[i])).tolist()
+        return min([i, *kin], key=lambda k: (self.library.simplicity((known[int(owner[k])],))[0], -gains[k]))
+
+    def take(self, i: int) -> None:
+        e = self.columns
+        own = e.rows.T @ e.rows[:, i] - e.seen.T @ e.seen[:, i] - self.pulled @ self.cross[i]
+        column = (own - sum((g * g[i] for g in self._gone), np.zeros_like(own))) / math.sqrt(self.curve[i])
+        self.slope, self.curve = self.slope - column * (self.slope[i] / column[i]), self.curve - column**2
+        self.picks, self._gone = [*self.picks, i], [*self._gone, column]
+        c = e.known[int(e.owner[i])]
+        # Not twice the same law at one site.
+        at_odds = np.array([self.library.related(k, c) for k in e.known])
+        self.open = self.open & ~at_odds[e.owner]
 
 
 def _both(curve: Array, slope: Array, low: Array, high: Array) -> Array:

@@ -12,7 +12,7 @@ from gapcert_diagnosis.fitting.fit import Fit, promising
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Candidate, Causes, Library
-from .criterion import Found, Keys, keys, noise, numbers, rank, scores, values, without
+from .criterion import Found, Keys, keys, noise, rank, scores, without
 from .fitted_sets import FittedSets
 from .gains import Promise
 
@@ -55,7 +55,7 @@ def additions(
     if not tried:
         return []
     best = finalists(tried, [keys(s.move) for s in long[: THRESHOLDS.near_ties]], sets.cautious)
-    grown = [((*causes, *s.move), values(sets.fit_further(first))) for s, first in best]
+    grown = [((*causes, *s.move), sets.fit_further(first).values) for s, first in best]
     full = rank([(new, sets.fit(new, base, start)) for new, start in grown], sets.cautious)
     least = (full[0][1] if known is None else known).chi.sum()
     close = [s for s, f in full if f.chi.sum() < THRESHOLDS.close_residual * least]
@@ -135,7 +135,7 @@ def stuck(sets: FittedSets, causes: Causes, but: Collection[Keys]) -> list[Promi
     dry = [c for c in library.candidates if len(library.dry((c,))) == 1 == len(c.effect.parameters)]
     for c in (c for c in dry if keys((c,)) not in but):
         h, names, starts = library.hypothesis((c,)), library.names(c), library.starts(c)
-        thetas = [numbers(h, values(brief) | dict(zip(names, row, strict=True))) for row in starts.tolist()]
+        thetas = [h.theta(brief.values | dict(zip(names, row, strict=True))) for row in starts.tolist()]
         theta = promising(h, sets.short, np.array(thetas), brief.start)[0]
         out.append(Promise((c,), {n: float(theta[h.names.index(n)]) for n in names}, 0.0))
     return out
@@ -161,8 +161,8 @@ def idle(sets: FittedSets, found: Found, new: Causes) -> bool:
 def _astray(sets: FittedSets, found: Found, old: Candidate, come: Candidate, new: Causes) -> bool:
     """Do all first values of a law leave plainly more than what it would take the place of?"""
     h, names, starts = sets.library.hypothesis(new), sets.library.names(come), sets.library.starts(come)
-    known, same = values(found[1]), sets.carry(old, come, found, default=False)
-    thetas = [numbers(h, known | dict(zip(names, row, strict=True)) | same) for row in starts.tolist()]
+    known, same = found[1].values, sets.carry(old, come, found, default=False)
+    thetas = [h.theta(known | dict(zip(names, row, strict=True)) | same) for row in starts.tolist()]
     return promising(h, sets.windows, np.array(thetas), found[1].start)[2] > THRESHOLDS.astray * float(
         np.sum(found[1].residual ** 2)
     )

@@ -9,19 +9,19 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any, final
 
 import numpy as np
 
 from gapcert.plugin import Array, Model, difference
-from gapcert_diagnosis.data.dataset import Windows
+from gapcert_diagnosis.data.dataset import Windows, flat, once
 from gapcert_diagnosis.fitting.fit import Fit
-from gapcert_diagnosis.fitting.linearised import Motion, Path
+from gapcert_diagnosis.fitting.linearised import Motion, Path, sliding, velocity
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
-from .candidates import Candidate, Causes, Library, once
+from .candidates import Candidate, Causes, Library
 from .gains import GainTable, Promise, Push
 
 ROWS = 512  # motions that are stepped together: more no longer stay near the processor
@@ -29,7 +29,7 @@ ROWS = 512  # motions that are stepped together: more no longer stay near the pr
 
 @final
 class Screen:
-    """Pushes of all candidates on some windows, made once; and what they promise for the fit of any set of causes."""
+    """Pushes of all candidates on some windows, made once: how large these are, what they promise for the fit of any set."""
 
     def __init__(self, library: Library, windows: Windows, guess: Fit, tell: Callable[[str], None] = lambda text: None) -> None:
         self.tell = tell
@@ -38,7 +38,7 @@ class Screen:
         if len(rows) > few:
             rows = np.unique(np.linspace(0, len(windows) - 1, few).astype(int))
         self.library, self.rows, self.windows = library, rows, windows.take(rows)
-        self.path = Path(self.windows, replace(guess, start=guess.start[rows]))
+        self.path = Path(self.windows, guess, guess.start[rows])
         self._pushes: dict[tuple[str, str], Push] = {}
         self._made: dict[object, Any] = {}
 
@@ -121,6 +121,46 @@ class Screen:
         early = self.windows.t < before
         return push.state is not None and bool(np.any(push.state)) and not np.any(push.state[early])
 
+    def share(self, c: Candidate, values: Mapping[str, float]) -> float:
+        """Root mean square of what a cause does in the window where it does most, over that of the effort at its site.
+
+        Of a parameter: infinite where it is outside of its tolerance, else zero; without one, how much of its scale it moved.
+        """
+        library, m = self.library, self.windows.measured
+        if (doubt := library.doubted(c)) is not None:
+            return abs(values[library.names(c)[0]] - library.off(c)[0]) / doubt
+        if (freed := library.freed(c)) is not None:
+            return math.inf if abs(values[freed.name] - freed.value) > freed.tolerance else 0.0
+        push = self.push_at(c, values)
+        if push.output is not None:
+            channel = [s.name for s in m.channels].index(c.site)
+            return _most(push.output[:, :, channel]) / float(m.spread[channel])
+        assert push.state is not None, "what frees no number moves the state or the output"
+        moved = push.state[..., 0]
+        if c.effect.site == "coordinate":
+            return _most(self._force(c, moved)) / library.scales(c)["force"]
+        column, effort = self.once(("felt", c.site), lambda: self._felt(c))
+        return _most(moved[..., column]) / float(effort)
+
+    def _force(self, c: Candidate, moved: Array) -> Array:
+        """The force at a coordinate that makes one-step differences (W, S, nx)."""
+        response = self.once(("sliding", c.site), lambda: sliding(self.library.model, c.site, *self._states()))
+        v = velocity(self.library.model, c.site, response)
+        return np.asarray(moved[..., v] / response[:, v].reshape(moved.shape[:2]))
+
+    def _felt(self, c: Candidate) -> tuple[int, float]:
+        """(column, root mean square) of what the input at the site does to the state in one step, where it does most."""
+        model, (x, u) = self.library.model, self._states()
+        without = np.where([s.name == c.site for s in model.inputs], 0.0, u)
+        pushed = difference(model.states, model.step(x, u).x, model.step(x, without).x)
+        sizes = np.sqrt(np.mean(pushed**2, axis=0))
+        most = int(np.argmax(sizes / (np.std(x, axis=0) + 1e-300)))
+        return most, float(sizes[most]) or 1e-300
+
+    def _states(self) -> tuple[Array, Array]:
+        """States and inputs (W·S, ·) of the path, without history."""
+        return flat(self.path.x[:, self.path.lead :]), flat(self.path.u[:, self.path.lead :])
+
     def rank(self, fits: Sequence[tuple[Fit, int]], moves: Sequence[Causes]) -> list[list[Promise]]:
         """Per fit, whose windows are these cut into so many parts, the moves by their promise, best first."""
         out = []
@@ -186,3 +226,8 @@ def _between(values: Array, best: Array, amplitude: int | None) -> Array:
     out = np.tile(best, (THRESHOLDS.finer_scan, 1))
     out[:, k] = np.linspace(known[max(at - 1, 0)], known[min(at + 1, len(known) - 1)], THRESHOLDS.finer_scan + 2)[1:-1]
     return out
+
+
+def _most(a: Array) -> float:
+    """The largest root mean square of a window."""
+    return float(np.sqrt(np.mean(a.reshape(len(a), -1) ** 2, axis=1).max()))

@@ -1,21 +1,62 @@
-"""Which causes, of a model in equations: single steps, several causes at once where these lead nowhere, exchanges and drops."""
+"""Which causes, of a model in equations: single steps, several causes at once where these lead nowhere, exchanges and drops.
+
+They are looked for on earlier windows, and a set is kept as far as later ones agree.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import final
 
 import numpy as np
 
 from gapcert.plugin import Array
-from gapcert_diagnosis.fitting.fit import Fit
+from gapcert_diagnosis.data.dataset import Windows
+from gapcert_diagnosis.fitting.fit import Fit, fit, followed
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Candidate, Causes, Library
-from .criterion import Found, Keys, beats, keys, margin, noise, outdoes, rank, values, without
-from .fitted_sets import FittedSets
+from .criterion import Found, Keys, agrees, beats, better, fails, keys, margin, noise, outdoes, rank, without
+from .fitted_sets import FittedSets, untold
 from .moves import additions, idle, merges, spared, swaps
 from .selection import drop, forward
+
+
+def search_windows(
+    library: Library, windows: Windows, progress: Callable[..., None] = untold, plain: Fit | None = None
+) -> tuple[FittedSets, Found]:
+    """(fitted sets, what was found): on the earlier windows, agreed by the later ones, with the input held as fits best.
+
+    A hold that is not declared is zero, unless the other one makes the final model better: a wrong one looks like half a
+    sample of delay, so neither can be chosen before the causes are there. plain: the fit of nothing to the earlier windows.
+    """
+    first = _guarded(library, windows, progress, plain)
+    if windows.measured.hold is not None:
+        return first
+    causes, fitted = first[1]
+    other = windows.with_hold("first")
+    again = fit(fitted.hypothesis, other.guard()[0], theta=fitted.theta)
+    if better(again, fitted) <= THRESHOLDS.tie_score:
+        return first
+    second = _guarded(library, other, progress)
+    fewer = len(second[1][0]) < len(causes)
+    return second if better(second[1][1], fitted) > (-THRESHOLDS.tie_score if fewer else THRESHOLDS.tie_score) else first
+
+
+def _guarded(
+    library: Library, windows: Windows, progress: Callable[..., None], plain: Fit | None = None
+) -> tuple[FittedSets, Found]:
+    earlier, later = windows.guard()
+    sets = FittedSets(library, earlier, progress, plain)
+    search = EquationSearch(sets)
+    found = drop_unconfirmed(sets, search.select(), later)
+    if noise(found[1], THRESHOLDS.sure_errors) and not noise(judge(found[1], later), THRESHOLDS.sure_errors):
+        # Near the noise of the earlier windows by chance, or by a stand-in.
+        search.thorough = True
+        found = drop_unconfirmed(sets, search.select(), later)
+    if fails(judge(found[1], later), max(1.0, float(found[1].chi.max()))):
+        found = _events(sets, found, windows, float(later.t.min()))
+    return sets, found
 
 
 @final
@@ -36,7 +77,7 @@ class EquationSearch:
         if best[1].rough:
             sets.cautious = True
             first, best = self.refine(best), self.forward()
-            most = max(1, len(first[0]) - len(best[0])) * sets.library.threshold
+            most = max(1, len(first[0]) - len(best[0])) * sets.library.charge()
             best = first if sets.better(first[1], best[1]) > most and sets.matters(first) else best
         return self.try_pairs(best)
 
@@ -72,7 +113,7 @@ class EquationSearch:
         rest = without(found[0], (cause,))
         grown, fitted = len(rest) > 1 and self.sets.known(rest) is not None, self.sets.fit(rest, found)
         # What was grown step by step may sit in a valley that only the larger set leads out of.
-        return rest, self.sets.fit_again(rest, None, values(found[1])) if grown else fitted
+        return rest, self.sets.fit_again(rest, None, found[1].values) if grown else fitted
 
     def pays(self, found: Found, rest: Found) -> bool:
         return self.sets.pays(found, rest)
@@ -86,7 +127,7 @@ class EquationSearch:
             piles = table.pursue(THRESHOLDS.most_moves)
             if piles and piles[0].gain < THRESHOLDS.alone_promise * piles[-1].gain:
                 grown = piles[-1].move
-                new = self.refine((grown, sets.fit(grown, base, values(sets.try_move(base, piles[-1])))))
+                new = self.refine((grown, sets.fit(grown, base, sets.try_move(base, piles[-1]).values)))
                 if noise(new[1], THRESHOLDS.sure_errors) and sets.pays(new, base) and sets.matters(new):
                     self.piled = keys(new[0])
                     return new
@@ -103,7 +144,7 @@ class EquationSearch:
         promised = [s for table in sets.screen.tables(sets.fits(nothing)) for s in table.pairs(THRESHOLDS.paired_short_fits)]
         most = max((s.gain for s in promised), default=0.0)
         silent = noise(found[1], THRESHOLDS.sure_errors) and bool(found[0])
-        if most < (THRESHOLDS.paired_share * self._explained(found[1]) if silent else 2 * sets.library.threshold):
+        if most < (THRESHOLDS.paired_share * self._explained(found[1]) if silent else 2 * sets.library.charge()):
             return found
         now = sets.fit_further(now)
         moves = {keys(s.move): s for s in reversed(promised)}
@@ -111,9 +152,9 @@ class EquationSearch:
         best = found
         for causes, first in tried[: THRESHOLDS.paired_full_fits]:
             if beats(first, now, sets.cautious, fewer=len(causes) < len(best[0])):
-                new = self.refine((causes, sets.fit(causes, nothing, values(sets.fit_further(first)))))
+                new = self.refine((causes, sets.fit(causes, nothing, sets.fit_further(first).values)))
                 more = beats(new[1], best[1], sets.cautious, fewer=len(new[0]) < len(best[0]))
-                enough = sets.better(new[1], sets.nothing) > len(new[0]) * sets.library.threshold
+                enough = sets.better(new[1], sets.nothing) > len(new[0]) * sets.library.charge()
                 if more and enough and sets.pays(new, nothing) and sets.matters(new):
                     best = new
         return best
@@ -129,7 +170,7 @@ class EquationSearch:
         rest = tuple(c for c in found[0] if c.key not in small)
         if not small or keys(rest) <= keys(parent[0]):
             return found
-        return rest, self.sets.fit(rest, parent, values(found[1]))
+        return rest, self.sets.fit(rest, parent, found[1].values)
 
     def refine(self, found: Found) -> Found:
         """Drops, swaps for simpler and richer laws and merges, until none of them pays."""
@@ -187,3 +228,52 @@ def lightest(library: Library, causes: Causes, fitted: Fit) -> tuple[Causes, Arr
 
     order = sorted(range(len(causes)), key=lambda i: share([i]))
     return tuple(causes[i] for i in order), np.array([share(order[: i + 1]) for i in range(len(order))])
+
+
+def _events(sets: FittedSets, found: Found, windows: Windows, known: float) -> Found:
+    """With what only the later windows show: a push that came then, or a level that was not reached before."""
+    whole = FittedSets(sets.library, windows, sets.progress)
+    base = found[0], whole.fit(found[0], None, found[1].values)
+    before = np.maximum(judge(base[1], sets.windows).chi, 1.0)
+    for causes, fitted in additions(whole, base):
+        silent = all(whole.screen.silent(c, fitted.values, known) for c in without(causes, base[0]))
+        calm = silent or (judge(fitted, sets.windows).chi < THRESHOLDS.calm_residual * before).all()
+        if calm and whole.pays((causes, fitted), base) and whole.matters((causes, fitted)):
+            return causes, sets.fit(causes, found, fitted.values)
+    return found
+
+
+def drop_unconfirmed(sets: FittedSets, found: Found, guard: Windows) -> Found:
+    """What is left of a set once later data are asked: first about the whole, then about each cause without it."""
+    causes, now = found
+    if not causes:
+        return (), sets.nothing
+    own = judge(now, guard)
+    if not confirms(now, sets.nothing, guard, own):
+        left = [(rest, sets.fit(rest, found)) for rest in (without(causes, (c,)) for c in causes)]
+        return drop_unconfirmed(sets, min(left, key=lambda f: float(judge(f[1], guard).chi.sum())), guard)
+    adequate = own.chi.max() < THRESHOLDS.adequate_residual
+    for c in reversed(causes):
+        rest = without(causes, (c,))
+        fitted = sets.fit(rest, found)
+        if rest and not confirms(now, fitted, guard, own):
+            return drop_unconfirmed(sets, (rest, fitted), guard)
+        # A law that contains a simpler one has to earn its place beside it as well.
+        for e in sets.library.candidates:
+            if not adequate and sets.library.within(e, c):
+                new = tuple(e if k is c else k for k in causes)
+                simple = sets.fit(new, found, sets.carry(c, e, found))
+                if not confirms(now, simple, guard, own):
+                    return drop_unconfirmed(sets, (new, simple), guard)
+    return causes, now
+
+
+def judge(fitted: Fit, windows: Windows, start: Array | None = None) -> Fit:
+    """The same numbers on other windows; only the starts are free."""
+    return followed(fitted.hypothesis, fitted.theta, windows, start)
+
+
+def confirms(new: Fit, old: Fit, later: Windows, own: Fit | None = None) -> bool:
+    """Does the new fit agree with later data beside the old one? own: its numbers on these, where that is known."""
+    one = own or judge(new, later)
+    return agrees(new, old, one, judge(old, later, one.start))

@@ -1,1 +1,0 @@
-"""What would tell apart what these data do not."""
