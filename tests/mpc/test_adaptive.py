@@ -12,7 +12,7 @@ import pytest
 from gapcert import Domain, Goal, Interval, SynthesisProblem, UsageError, closed_loop, load_controller, load_spec
 from gapcert_cells.testing import Band, Rod, rod_problem
 from gapcert_closed_loop.closed_loop import compare_loops
-from gapcert_closed_loop.parameter_sets import summary
+from gapcert_closed_loop.prediction import summary
 from gapcert_figures.data import loop_figure
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.synthesizer import Mpc
