@@ -25,7 +25,7 @@ from gapcert.contracts.plugins.events import silent
 from gapcert.run.build import Build
 from gapcert_cells.testing import Band
 from gapcert_mpc.synthesizer import Mpc
-from gapcert_mpc.variants.membership import Membership
+from gapcert_mpc.variants.parameters import Membership
 
 SPEC = Path(__file__).parents[1] / "specs" / "pendulum_adaptive.yaml"
 TRUE = 1.3

@@ -19,10 +19,9 @@ from gapcert_cells import loading, write_saved
 
 from .planning.arrival import Arrival
 from .planning.design import Design
-from .planning.engine import Engine, Planner, Tracker
+from .planning.engine import Engine, Landing, Planner, Tracker
 from .planning.plans import Held, Memory, Plan
 from .planning.successive import Successive
-from .planning.terminal_boxes import Landing
 from .planning.tracking import another
 from .program.linearise import Nominal
 from .program.solver import Name

@@ -15,7 +15,6 @@ from gapcert_cells.testing import Band
 from gapcert_equations.config import EquationsConfig
 from gapcert_mpc import controller, task
 from gapcert_mpc.controller import MpcController
-from gapcert_mpc.invariant import margin
 from gapcert_mpc.planning import successive
 from gapcert_mpc.planning.plans import Held
 from gapcert_mpc.planning.successive import Successive
@@ -23,6 +22,7 @@ from gapcert_mpc.program.linearise import Frame, Nominal, Stages
 from gapcert_mpc.program.program import Program
 from gapcert_mpc.program.solver import SOLVERS
 from gapcert_mpc.synthesizer import Mpc
+from gapcert_mpc.variants.regulation import margin
 
 Array = np.ndarray
 CARTPOLE = {

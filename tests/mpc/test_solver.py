@@ -16,9 +16,8 @@ from gapcert import UsageError, closed_loop
 from gapcert_cells.testing import Band, Rod, rod_problem
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.planning.engine import Engine
-from gapcert_mpc.program.pieces import Pieces
 from gapcert_mpc.program.solver import SOLVERS, Osqp, QpSolver, solver
-from gapcert_mpc.program.tuning import tuned
+from gapcert_mpc.program.tuning import Pieces, tuned
 from gapcert_mpc.synthesizer import Mpc
 
 Array = np.ndarray

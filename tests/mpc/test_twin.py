@@ -13,9 +13,9 @@ from tube_designs import drawn, mecanum, with_pieces
 from gapcert_mpc.planning.design import Design
 from gapcert_mpc.planning.engine import Engine
 from gapcert_mpc.program.constraints import Preferred
-from gapcert_mpc.program.minimal_tube import Least
 from gapcert_mpc.program.program import Program
 from gapcert_mpc.program.solver import SOLVERS, solver
+from gapcert_mpc.program.tuning import Least
 
 Array = np.ndarray
 

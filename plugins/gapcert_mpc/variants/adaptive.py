@@ -21,8 +21,7 @@ from gapcert_mpc.saved_models import known, pair
 from gapcert_mpc.task import Task
 from gapcert_mpc.thresholds import THRESHOLDS
 
-from .membership import Membership
-from .parameters import Family
+from .parameters import Family, Membership
 
 Key = tuple[tuple[int, int, int], ...]
 Maker = Callable[[SynthesisProblem, MpcController | None], MpcController]
