@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from copy import copy
 from pathlib import Path
 from typing import final
 
-from gapcert import Controller, Domain, Goal, Model, SynthesisProblem, UsageError
+from gapcert.plugin import Controller, Domain, Goal, Model, SynthesisProblem, UsageError
 from gapcert_cells import loading
 
 from .controller import MpcController
-from .planning import tracking
-from .program.constraints import limits, preferred
-from .task import MpcOptions, Task, frame_of
+from .planning.requirements import check_reference, limits, moments, preferred
+from .task import MpcOptions, Task
 from .variants.adaptive import AdaptiveMpcController, adaptive
 from .variants.parameters import named, ranged
 from .variants.reaching import reaching
@@ -52,10 +50,10 @@ class Mpc(MpcOptions):
         for field, given in (("reference", [*self.reference]), ("weights", [*self.weights])):
             if unknown := [n for n in given if n not in names]:
                 raise UsageError(f"controller.{field}: '{unknown[0]}' is unknown; expected some of {', '.join(names)}")
-        tracking.check(self.reference, domain.axes, model.period)
+        check_reference(self.reference, domain.axes, model.period)
         limits(self.rates, domain)
-        preferred(self.soft, domain, frame_of(goal, domain), 1.0)
-        moves = len(tracking.moments(self.reference, model.period)) > 1
+        preferred(self.soft, domain, Task(SynthesisProblem(model, None, domain, goal), self).frame, 1.0)
+        moves = len(moments(self.reference, model.period)) > 1
         for field, used, what in (
             ("reference", moves, "what is wanted moves"),
             ("rates", bool(self.rates), "inputs are limited in how fast they change"),
@@ -71,8 +69,17 @@ class Mpc(MpcOptions):
 
     def synthesize(self, problem: SynthesisProblem) -> Controller:
         self.check(problem.model, problem.domain, problem.goal)
-        make = next(make for suits, make in VARIANTS if suits(self, problem.goal))
-        return make(Task(problem, self))
+        task = Task(problem, self)
+        if self.feedback == "disturbance":
+            # Its programs are compiled: nobody else waits for that.
+            from .variants.disturbance import answering
+
+            return answering(task)
+        if self.terminal is not None:
+            return handed(task)
+        if self.adapt:
+            return adaptive(task, Mpc(**self.of_boxes).for_box)
+        return reaching(task) if problem.goal.kind == "reach_avoid" else regulating(task)
 
     def for_box(self, problem: SynthesisProblem, like: MpcController | None) -> MpcController:
         """For one box of the parameters; those after the first have its gain and its solver, and are made as a run goes on."""
@@ -90,24 +97,7 @@ class Mpc(MpcOptions):
         if "adapt" in data:
             return AdaptiveMpcController.load(folder, lambda options: Mpc(**options).for_box)
         if "feedback" in data:
-            # Its programs are compiled: nobody else waits for that.
             from .variants.disturbance import DisturbanceMpcController
 
             return DisturbanceMpcController.load(folder)
         return MpcController.load(folder)
-
-
-def _answering(task: Task) -> Controller:
-    from .variants.disturbance import answering
-
-    return answering(task)
-
-
-VARIANTS: tuple[tuple[Callable[[MpcOptions, Goal], bool], Callable[[Task], Controller]], ...] = (
-    (lambda options, goal: options.feedback == "disturbance", _answering),
-    (lambda options, goal: options.terminal is not None, handed),
-    (lambda options, goal: bool(options.adapt), lambda task: adaptive(task, Mpc(**task.options.of_boxes).for_box)),
-    (lambda options, goal: goal.kind == "reach_avoid", reaching),
-    (lambda options, goal: True, regulating),
-)
-"""Who makes controllers, and when: the first that suits."""

@@ -11,13 +11,12 @@ from typing import Any, Literal, final
 
 import numpy as np
 
-from gapcert import Array, Domain, Goal, SynthesisProblem
-from gapcert.plugin import Pulse, Synthesizer
+from gapcert.plugin import Array, Domain, Pulse, SynthesisProblem, Synthesizer
 from gapcert_mpc.thresholds import THRESHOLDS
 
 from .config import Soft, Terminal
 from .controller import MpcController
-from .planning import tracking
+from .planning import requirements
 from .program.linearise import Frame, Nominal, Stages
 from .program.program import Rows, Weights
 from .program.solver import Choice
@@ -50,7 +49,7 @@ class MpcOptions(Synthesizer):
         feedback: Literal["fixed", "disturbance"] = "fixed",
     ) -> None:
         self.rates, self.soft = dict(rates or {}), {n: Soft.model_validate(v) for n, v in (soft or {}).items()}
-        self.horizon, self.reference, self.weights = horizon, tracking.stated(reference or {}), dict(weights or {})
+        self.horizon, self.reference, self.weights = horizon, requirements.stated(reference or {}), dict(weights or {})
         self.solver: Choice = solver
         self.tolerance, self.majorant, self.linearisation = tolerance, majorant, linearisation
         self.searches, self.terminal = searches, None if terminal is None else Terminal.model_validate(terminal)
@@ -62,12 +61,6 @@ class MpcOptions(Synthesizer):
         """Those of the controllers for boxes of parameters, JSON-able."""
         names = signature(MpcOptions).parameters.keys() - {"adapt", "levels", "terminal"}
         return {name: getattr(self, name) for name in sorted(names)}
-
-
-def frame_of(goal: Goal, domain: Domain) -> Frame:
-    """Of the states of a goal, and inputs."""
-    box = Domain(goal.stay, domain.inputs)
-    return Frame.of(box.low, box.high, domain.nx)
 
 
 @final
@@ -90,7 +83,7 @@ class Task:
 
     @cached_property
     def frame(self) -> Frame:
-        return frame_of(self.problem.goal, self.problem.domain)
+        return Frame.of(self.box.low, self.box.high, self.problem.domain.nx)
 
     @cached_property
     def nominal(self) -> Nominal:
@@ -128,8 +121,8 @@ class Task:
 
     def wanted(self, step: int = 0) -> tuple[Array, Array]:
         """The reference at a step of a run in the frame, and how much each of it matters."""
-        now = tracking.at(self.options.reference, step, self.problem.model.period)
-        return tracking.wanted(now, self.problem.domain.axes, self.frame)
+        now = requirements.at(self.options.reference, step, self.problem.model.period)
+        return requirements.wanted(now, self.problem.domain.axes, self.frame)
 
     def weights(self, stages: Stages) -> Weights:
         cost = np.array([float(self.options.weights.get(axis.name, 1.0)) for axis in self.problem.domain.axes])

@@ -277,9 +277,9 @@ def test_updates_equal_a_fresh_program(cartpole: MpcController) -> None:
     assert (program.high == fresh.high).all()
     for solver in (SOLVERS["piqp"], SOLVERS["clarabel"]):
         first = design.program()
-        used = solver(first.P, first.q, first.A, first.low, first.high, 1e-6)
-        used.update(A=program.A.data, low=program.low, high=program.high)
-        a, b = used.solve(), solver(first.P, first.q, program.A, program.low, program.high, 1e-6).solve()
+        used, now = solver(first.qp, 1e-6), program.qp._replace(P=first.P, q=first.q)
+        used.update(now, varied=True)
+        a, b = used.solve(), solver(now, 1e-6).solve()
         assert a.status == b.status == "solved"
         np.testing.assert_allclose(a.z[program.at["u"]], b.z[program.at["u"]], atol=1e-3)
 

@@ -17,8 +17,8 @@ from gapcert_cells.testing import Band, Rod, rod_problem, rod_reach_avoid
 from gapcert_closed_loop.closed_loop import compare_loops
 from gapcert_figures.data import Figures, loop_figure
 from gapcert_mpc.controller import MpcController
-from gapcert_mpc.planning.tracking import Course
-from gapcert_mpc.program.solver import Piqp
+from gapcert_mpc.planning.design import Course
+from gapcert_mpc.program.solver import Piqp, Qp
 from gapcert_mpc.synthesizer import Mpc
 from gapcert_report.pictures.loop import wanted_pictures
 
@@ -103,7 +103,7 @@ def test_a_plan_that_had_to_end_at_the_reference_would_be_lost(controller: MpcCo
     fixed = sp.csc_matrix((np.ones(program.n), (np.arange(program.n), pair)), shape=(program.n, program.size))
     at = held.aim[: program.n]
     A, low, high = sp.vstack([program.A, fixed], format="csc"), np.append(program.low, at), np.append(program.high, at)
-    assert Piqp(program.P, program.q, A, low, high, 1e-8).solve().status == "infeasible"
+    assert Piqp(Qp(program.P, program.q, A, low, high), 1e-8).solve().status == "infeasible"
 
 
 def test_a_run_takes_another_reference_and_others_do_not(controller: MpcController) -> None:

@@ -10,8 +10,7 @@ import numpy as np
 import scipy.optimize
 import scipy.sparse as sp
 
-from gapcert import Array
-from gapcert.plugin import Ints
+from gapcert.plugin import Array, Ints
 from gapcert_engines import muted
 from gapcert_mpc.program.corridors import Scene, read
 from gapcert_mpc.program.program import Program

@@ -8,8 +8,7 @@ from typing import Protocol, final
 
 import numpy as np
 
-from gapcert import Array
-from gapcert.plugin import Bools
+from gapcert.plugin import Array, Bools
 from gapcert_mpc.program.solver import Name, Piqp, QpSolver, solver
 from gapcert_mpc.program.tuning import Pieces
 from gapcert_mpc.thresholds import THRESHOLDS
@@ -24,12 +23,12 @@ class Engine:
 
     def __init__(self, design: Design, first: Name) -> None:
         self.program = p = design.program()
-        data, tuning = (p.P, p.q, p.A, p.low, p.high, p.tolerance), design.tuning
+        tuning = design.tuning
         self.pieces = Pieces(p, tuning.pieces, design.reference[: p.n]) if p.steady else None
         own = {"rho": tuning.rho, "alpha": tuning.alpha} if first == "osqp" else {}
-        self.solvers: list[QpSolver] = [solver(first, *data, **own)]
+        self.solvers: list[QpSolver] = [solver(first, p.qp, p.tolerance, **own)]
         if first != "piqp":
-            self.solvers.append(Piqp(*data))
+            self.solvers.append(Piqp(p.qp, p.tolerance))
         self.later = p.shifted()
         self.rest = design.reference[p.n :]
 
@@ -44,13 +43,13 @@ class Engine:
         return self.found(x, z, y, first, before=before)
 
     def found(
-        self, x: Array, z: Array, y: Array, first: int = 0, A: Array | None = None, before: Array | None = None
+        self, x: Array, z: Array, y: Array, first: int = 0, varied: bool = False, before: Array | None = None
     ) -> Plan | None:
-        """By the first solver that finds one, from a guess; A: its new values, if it has any."""
+        """By the first solver that finds one, from a guess; varied: the program has other stages than before."""
         program = self.program
         program.begin(x, before)
         for s in self.solvers:
-            s.update(A=A, q=program.q, low=program.low, high=program.high)
+            s.update(program.qp, varied)
             found = s.solve(z, y)
             last = s is self.solvers[-1]
             if found.status == "infeasible" and last:
@@ -58,7 +57,7 @@ class Engine:
             # Rows decide: a plan that keeps them is one, though it may not be the best.
             if found.status == "solved" or last:
                 # Where lines vary, the tube is taken along the lines of the plan.
-                kept = found.z if A is not None or self.pieces is None else self.pieces.least(found.z)
+                kept = found.z if varied or self.pieces is None else self.pieces.least(found.z)
                 # NaN compares as False, so that it keeps nothing.
                 if program.missed(kept, x, before) <= program.tolerance:
                     return plan(program, kept, found.y, first)

@@ -9,8 +9,7 @@ from typing import final
 
 import numpy as np
 
-from gapcert import Array, Box, Ellipsoid, Goal, Polytope, Region
-from gapcert.plugin import Bools, Ints
+from gapcert.plugin import Array, Bools, Box, Ellipsoid, Goal, Ints, Polytope, Region
 from gapcert_mpc.thresholds import THRESHOLDS
 
 from .linearise import Frame

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 import scipy.linalg
 
-from gapcert import Array, Domain, Interval
-from gapcert.plugin import majorant_of
+from gapcert.plugin import Array, Domain, Interval, majorant_of
 from gapcert_mpc.thresholds import THRESHOLDS
 
 from .linearise import Frame, Nominal, Stages, in_frame, tiles

@@ -10,8 +10,7 @@ from typing import final
 import numpy as np
 
 import gapcert
-from gapcert import Array, GapFunction, Interval, Model
-from gapcert.plugin import Bools, majorant_of
+from gapcert.plugin import Array, Bools, GapFunction, Interval, Model, majorant_of
 from gapcert_mpc.thresholds import THRESHOLDS
 
 

@@ -10,13 +10,11 @@ from typing import final
 import numpy as np
 import scipy.sparse as sp
 
-from gapcert import Array
-from gapcert.plugin import Ints
+from gapcert.plugin import Array, Ints
 from gapcert_mpc.thresholds import THRESHOLDS
 
-from .constraints import Preferred
 from .linearise import Stages
-from .solver import Piqp
+from .solver import Piqp, Qp
 from .tube import Section
 
 
@@ -44,6 +42,18 @@ class Rows:
     C: Array
     low: Array
     high: Array
+
+
+@final
+@dataclass(frozen=True)
+class Preferred:
+    """low ≤ z_j ≤ high is preferred for the j in `axis`, each (q,), in the frame; an excess e costs linear·e + quadratic·e²."""
+
+    axis: Array
+    low: Array
+    high: Array
+    linear: Array
+    quadratic: Array
 
 
 @final
@@ -173,6 +183,11 @@ class Program:
     def s0(self) -> Array:
         """s₀ (p,): x̄₀ is the state to within ε, as every equation is kept."""
         return np.asarray(np.abs(self.section.H).sum(axis=1) * self.tolerance)
+
+    @property
+    def qp(self) -> Qp:
+        """As a solver takes it: for the start, the reference and the bounds that were set last."""
+        return Qp(self.P, self.q, self.A, self.low, self.high)
 
     @property
     def size(self) -> int:
@@ -380,7 +395,8 @@ class Program:
         A = self.A[kept][:, columns]
         goal, weight = np.zeros(len(columns)), np.full(len(columns), 1e-9)
         goal[: n + m], weight[: n + m] = z, np.maximum(weights, 1e-6)
-        found = Piqp(sp.diags(weight, format="csc"), -weight * goal, A, self.low[kept], self.high[kept], 1e-8).solve()
+        qp = Qp(sp.diags(weight, format="csc"), -weight * goal, A, self.low[kept], self.high[kept])
+        found = Piqp(qp, 1e-8).solve()
         return found.z[: n + m] if found.status == "solved" else None
 
     # -- cost -------------------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from typing import final
 import numpy as np
 import scipy.linalg
 
-from gapcert import Array, UsageError
+from gapcert.plugin import Array, UsageError
 from gapcert_mpc.thresholds import THRESHOLDS
 
 

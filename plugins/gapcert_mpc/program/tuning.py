@@ -12,7 +12,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg
 from scipy.linalg.blas import dtbsv
 
-from gapcert import Array
+from gapcert.plugin import Array
 from gapcert_mpc.thresholds import THRESHOLDS
 
 from .program import Program
@@ -94,7 +94,7 @@ class Pieces:
         """kept (k, rows): −1 at the lower bound, 1 at the upper, 0 where the row does not matter; equations count anyway."""
         self.program, self.least, self.aimed = program, Least(program), program.aimed
         program.begin(aim)
-        centre = Piqp(program.P, program.q, program.A, program.low, program.high, program.tolerance).solve()
+        centre = Piqp(program.qp, program.tolerance).solve()
         made = [self._piece(active, centre.z) for active in (kept if centre.status == "solved" else kept[:0])]
         # What rules a piece out is looked at for all of them at once.
         self.ends = np.cumsum([0] + [len(sure) for _, sure, _ in made])[:-1]
@@ -217,7 +217,7 @@ def tuned(
 def _runs(program: Program, aim: Array, rng: np.random.Generator) -> list[_Seen]:
     st, n, seen, runs = program.stages, program.n, list[_Seen](), 0
     # Which rows hold a plan back shows where it is exact.
-    solver = Piqp(program.P, program.q, program.A, program.low, program.high, 1e-11)
+    solver = Piqp(program.qp, 1e-11)
     for number in range(THRESHOLDS.tuning_tries):
         if runs == THRESHOLDS.tuning_runs + THRESHOLDS.tuning_still:
             break
@@ -225,7 +225,7 @@ def _runs(program: Program, aim: Array, rng: np.random.Generator) -> list[_Seen]
         before = None
         for _ in range(THRESHOLDS.tuning_steps):
             program.begin(x)
-            solver.update(low=program.low, high=program.high)
+            solver.update(program.qp)
             answer = solver.solve()
             if answer.status != "solved":
                 break
@@ -239,12 +239,12 @@ def _runs(program: Program, aim: Array, rng: np.random.Generator) -> list[_Seen]
 
 def _work(program: Program, seen: list[_Seen], dear: Array, rho: float, alpha: float, most: float) -> float:
     """Iterations over the states seen, each from the plan before; where they are too many, the other method's are added."""
-    solver = Osqp(program.P, program.q, program.A, program.low, program.high, program.tolerance, rho, alpha)
+    solver = Osqp(program.qp, program.tolerance, rho, alpha)
     z, y, *none = program.shifted()
     total = 0.0
     for s, other in zip(seen, dear.tolist(), strict=True):
         program.begin(s.x)
-        solver.update(low=program.low, high=program.high)
+        solver.update(program.qp)
         found = solver.solve(*none) if s.before is None else solver.solve(s.before.z[z], s.before.y[y])
         total += found.iterations + (other if found.status != "solved" else 0.0)
         if total >= most:

@@ -11,8 +11,7 @@ from typing import Any, NamedTuple, final
 
 import numpy as np
 
-from gapcert import Array, Controller, Goal, Interval, SynthesisProblem
-from gapcert.plugin import Bools, Ints, Policy
+from gapcert.plugin import Array, Bools, Controller, Goal, Interval, Ints, Policy, SynthesisProblem
 from gapcert_cells import write_saved
 from gapcert_mpc.controller import MpcController, loaded
 from gapcert_mpc.planning.plans import Memory

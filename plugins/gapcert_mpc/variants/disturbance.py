@@ -13,8 +13,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 import scipy.linalg
 
-from gapcert import Array, Controller, Goal, UsageError
-from gapcert.plugin import Bools
+from gapcert.plugin import Array, Bools, Controller, Goal, UsageError
 from gapcert_cells import write_saved
 from gapcert_mpc.controller import MpcController, PlanController, loaded
 from gapcert_mpc.planning.design import Design

@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gapcert import Array
-from gapcert.plugin import Pulse
+from gapcert.plugin import Array, Pulse
 from gapcert_mpc.controller import MpcController, looked
 from gapcert_mpc.planning.arrival import Arrival
 from gapcert_mpc.planning.design import Design

@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from gapcert import Array, Interval
+from gapcert.plugin import Array, Interval
 from gapcert_mpc.controller import MpcController, looked
-from gapcert_mpc.planning import tracking
-from gapcert_mpc.planning.design import Design
+from gapcert_mpc.planning.design import Course, Design
+from gapcert_mpc.planning.requirements import limits, moments, preferred
 from gapcert_mpc.planning.successive import Ending
-from gapcert_mpc.program.constraints import limits, preferred
 from gapcert_mpc.program.linearise import Frame, Nominal, Stages
 from gapcert_mpc.program.program import NotShrinking
 from gapcert_mpc.program.solver import Name
@@ -80,7 +79,7 @@ def _section(stages: Stages, rows: Array, like: MpcController | None, rates: Arr
 
 def _design(task: Task, stages: Stages, section: Section, rates: Array | None) -> Design | str:
     options, domain, frame = task.options, task.problem.domain, task.frame
-    moments = tracking.moments(options.reference, task.problem.model.period)
+    steps = moments(options.reference, task.problem.model.period)
     weights, successive, nowhere = task.weights(stages), options.linearisation == "successive", np.zeros(len(frame.half))
     soft = preferred(options.soft, domain, frame, weights.T[0, 0] / THRESHOLDS.rest_weight)
     design = Design(frame, stages, section, task.rows, weights, nowhere, options.tolerance, successive, rates=rates)
@@ -88,11 +87,11 @@ def _design(task: Task, stages: Stages, section: Section, rates: Array | None) -
         program = design.program()
     except NotShrinking as error:
         return f"the tube grows without end: by {error.args[0]:.4g} per step; narrow the goal, or shorten the period"
-    found = [program.target(*task.wanted(step)) for step in moments]
+    found = [program.target(*task.wanted(step)) for step in steps]
     if (first := found[0]) is None:
         reason = "no steady state keeps its tube within the goal; widen the goal, or give the input more authority"
         return reason if successive else f"{reason}, or use {_HINT}"
-    course = tracking.Course(np.array(moments), np.array(found)) if len(found) > 1 else None
+    course = Course(np.array(steps), np.array(found)) if len(found) > 1 else None
     return replace(design, reference=first, course=course, soft=soft)
 
 

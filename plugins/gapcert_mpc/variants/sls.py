@@ -12,8 +12,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Array, UsageError
-from gapcert.plugin import Ints
+from gapcert.plugin import Array, Ints, UsageError
 from gapcert_mpc.thresholds import THRESHOLDS
 
 from . import sls_kernels as kernels

@@ -7,7 +7,7 @@ from typing import Any, Literal, final
 
 import numpy as np
 
-from gapcert import Array, UsageError
+from gapcert.plugin import Array, UsageError
 
 # N stages, n states, m inputs, c rows of a stage and e rows of the end.
 _SHAPES = {
