@@ -316,7 +316,7 @@ def test_saved_and_loaded_with_its_model(cartpole: MpcController, tmp_path: Path
 
 def test_the_option_is_one_of_a_spec() -> None:
     config = registry().config("synthesizer", "mpc")
-    assert registry().build("synthesizer", "mpc", config(linearisation="successive")).linearisation == "successive"
+    assert registry().build("synthesizer", "mpc", config(linearisation="successive")).options.linearisation == "successive"
 
 
 @pytest.mark.exam

@@ -30,7 +30,9 @@ WEIGHTS = {"omega": 0.01, "torque": 0.001}
 def _made(majorant: str = "constant", linear: float | None = 300.0) -> MpcController:
     soft = None if linear is None else {"omega": {**SOFT["omega"], "linear": linear, "quadratic": 0.0}}
     problem = rod_problem(gap=GAP)
-    found = Mpc(12, {"theta": 0.17}, WEIGHTS, solver="piqp", majorant=majorant, soft=soft).synthesize(problem)  # type: ignore[arg-type]
+    found = Mpc(horizon=12, reference={"theta": 0.17}, weights=WEIGHTS, solver="piqp", majorant=majorant, soft=soft).synthesize(
+        problem
+    )
     assert isinstance(found, MpcController)
     return found
 

@@ -131,8 +131,8 @@ def test_a_tube_that_follows_the_plan_ends_in_winning_cells_too() -> None:
 def test_a_spec_asks_for_it() -> None:
     config = MpcConfig.model_validate({"kind": "mpc", "terminal": CELLS | {"boxes": 3}})
     asked = registry().build("synthesizer", "mpc", config)
-    assert asked.terminal == Terminal(boxes=3, **CELLS)
-    assert registry().build("synthesizer", "mpc", MpcConfig()).terminal is None
+    assert asked.options.terminal == Terminal(boxes=3, **CELLS)
+    assert registry().build("synthesizer", "mpc", MpcConfig()).options.terminal is None
 
 
 def test_a_new_plan_takes_over_from_the_cells() -> None:

@@ -34,7 +34,9 @@ SCHEDULE = {"theta": {"at": [[k * PERIOD, at] for k, at in zip(JUMPS, WANTED, st
 
 @cache
 def _made() -> MpcController:
-    found = Mpc(HORIZON, SCHEDULE, {"omega": 0.01, "torque": 0.001}, majorant="constant").synthesize(rod_problem(gap=GAP))
+    found = Mpc(horizon=HORIZON, reference=SCHEDULE, weights={"omega": 0.01, "torque": 0.001}, majorant="constant").synthesize(
+        rod_problem(gap=GAP)
+    )
     assert isinstance(found, MpcController)
     return found
 
@@ -164,7 +166,7 @@ def test_saved_sent_and_shared_out_it_goes_the_same_way(controller: MpcControlle
 
 @pytest.mark.exam
 def test_the_report_shows_what_is_wanted(controller: MpcController, tmp_path: Path) -> None:
-    still = Mpc(5, majorant="constant", solver="piqp").synthesize(rod_problem(gap=GAP))
+    still = Mpc(horizon=5, majorant="constant", solver="piqp").synthesize(rod_problem(gap=GAP))
     loops = [compare_loops(Rod(), c, c, starts=2, steps=140, policies=()) for c in (controller, still)]
     figure, none = (loop_figure(loop, Rod(), c, c) for loop, c in zip(loops, (controller, still), strict=True))
     assert np.allclose(figure.wanted[[0, JUMPS[1] - 1, JUMPS[1]], 0], [WANTED[0], WANTED[0], WANTED[1]], atol=1e-3)

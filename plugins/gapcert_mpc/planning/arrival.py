@@ -232,7 +232,7 @@ class Search:
         first, where none is if there is none for it, then that of the plan that was found, and halfway back.
         """
         p = self.program
-        tube = last = p.tube(np.zeros((p.N + 1, len(p.F)))) if p.variable else p.constant
+        tube = last = p.tube() if p.variable else p.constant
         for i in range(THRESHOLDS.tube_rounds if p.variable else 0):
             found = self.solved(x, tube)
             if found is not None:

@@ -16,11 +16,6 @@ from gapcert_mpc.program.program import Preferred
 Reference = Mapping[str, Quantity | Schedule]
 
 
-def stated(reference: Mapping[str, object]) -> Reference:
-    """Each as a quantity or a schedule."""
-    return {n: Schedule.model_validate(v) if isinstance(v, Mapping) else v for n, v in reference.items()}  # type: ignore[misc]
-
-
 def begins(value: Quantity | Schedule, period: float) -> list[tuple[int, Quantity]]:
     """(step, value) of a reference: each holds from the first period that does not begin before its time."""
     if not isinstance(value, Schedule):

@@ -9,13 +9,11 @@ from typing import final
 
 import numpy as np
 
-from gapcert.plugin import Array, Bools, Box, Ellipsoid, Goal, Ints, Polytope, Region
+from gapcert.plugin import TURN, Array, Bools, Box, Ellipsoid, Goal, Ints, Polytope, Region
 from gapcert_mpc.thresholds import THRESHOLDS
 
 from .linearise import Frame
 from .program import Program, Rows
-
-TURN = 2 * np.pi
 
 
 @final

@@ -206,7 +206,7 @@ class Program:
         # The tube where it does not depend on the plan, else 0 but for s₀.
         self.constant = np.vstack([self.s0, np.zeros((N, self.p))])
         if not self.variable:
-            self.constant = self.tube(np.zeros((N, len(self.F))))
+            self.constant = self.tube()
         table, at = Table(), self.at
         self.start = table.rows(np.zeros((1, n)), np.zeros((1, n)))
         table.put("start", self.start, at["x"][:1], np.eye(n))
@@ -267,8 +267,9 @@ class Program:
         else:
             self.low[self.lower[down]] = np.maximum(low, -THRESHOLDS.loose_bound)[down] + self.off[down]
 
-    def tube(self, away: Array) -> Array:
-        """s (N+1, p) of a plan with a_k = away (≥ N, f)."""
+    def tube(self, away: Array | None = None) -> Array:
+        """s (N+1, p) of a plan with a_k = away (≥ N, f), by default 0: of one at rest where G has its centre."""
+        away = np.zeros((self.N, len(self.F))) if away is None else away
         s = np.vstack([self.s0, np.zeros((self.N, self.p))])
         for k in range(self.N):
             s[k + 1] = self.grown[k] @ s[k] + self.spread[k] + np.abs(self.section.H) @ self.stages.G[k] @ away[k]

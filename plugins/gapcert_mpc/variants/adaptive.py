@@ -270,13 +270,13 @@ class AdaptiveMpcController(Controller):
         return loaded(folder, made)
 
 
-def adaptive(task: Task, make: Maker) -> Controller:
-    """For parameters in the ranges that are asked for.
+def adaptive(task: Task, of_boxes: Mapping[str, Any], make: Maker) -> Controller:
+    """For parameters in the ranges that are asked for; of_boxes: the options by which `make` makes controllers.
 
     Without a gap the model is trusted as it is, at the middle of the ranges: nothing is learned then.
     """
     problem, options = task.problem, task.options
-    levels = Levels(family := Family.of(problem, options.adapt), options.of_boxes, options.levels, make)
+    levels = Levels(family := Family.of(problem, options.adapt), of_boxes, options.levels, make)
     first = levels[levels.first]
     if problem.gap is None or not first.wins:
         return first

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from copy import copy
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -260,12 +259,11 @@ class DisturbanceMpcController(PlanController[Run]):
 
 def answering(task: Task) -> Controller:
     """The controller with feedback from disturbances of the design that one gain has; that one itself where it wins nowhere."""
-    options = copy(task.options)
     # What it bounds is a constant, and no quadratic program is solved.
-    options.majorant, options.starts = "constant", 1
-    if not (fixed := regulating(replace(task, options=options))).wins:
+    options = task.options.model_copy(update={"majorant": "constant"})
+    if not (fixed := regulating(replace(task, options=options, starts=1))).wins:
         return fixed
-    x = task.drawn(np.random.default_rng(task.problem.seed), task.options.starts)
+    x = task.drawn(np.random.default_rng(task.problem.seed), task.starts)
     share = float(DisturbanceMpcController(fixed).contains(x).mean())
     told = dict(fixed.evidence) | {"feedback": "disturbance", "domain_fraction": share}
     return DisturbanceMpcController(replace(fixed, evidence=told))

@@ -41,7 +41,7 @@ def reaching(task: Task) -> MpcController:
     if not len(pool.arrival):
         return task.nothing(f"from none of {searches} starts a plan of {horizon} steps reaches the target with its whole tube")
     made = MpcController(goal, replace(design, pool=pool), {}, solver)
-    fraction = float(looked(made, task.drawn(rng, min(options.starts, THRESHOLDS.starts)), problem.emit).mean())
+    fraction = float(looked(made, task.drawn(rng, min(task.starts, THRESHOLDS.starts)), problem.emit).mean())
     tube = half_widths(design)
     evidence = {
         "horizon": horizon,
@@ -55,6 +55,4 @@ def reaching(task: Task) -> MpcController:
 
 def half_widths(design: Design) -> Array:
     """(N + 1, n + m), in the model's units: the tube around a plan at rest, before γ of a motion widens it."""
-    assert design.scene is not None, "who reaches a target knows its scene"
-    size = design.program().tube(np.zeros((design.stages.horizon + 1, len(design.scene.F))))
-    return np.asarray(size @ design.section.support.T * design.frame.half)
+    return np.asarray(design.program().tube() @ design.section.support.T * design.frame.half)

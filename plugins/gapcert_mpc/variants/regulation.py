@@ -58,7 +58,7 @@ def regulating(task: Task, like: MpcController | None = None) -> MpcController:
     elif options.solver != "auto":
         name = options.solver
     made = MpcController(problem.goal, design, {}, name, nominal=nominal if design.successive else None)
-    x = task.drawn(np.random.default_rng(problem.seed), options.starts)
+    x = task.drawn(np.random.default_rng(problem.seed), task.starts)
     evidence["domain_fraction"] = float(looked(made, x, problem.emit).mean())
     return replace(made, evidence=evidence)
 

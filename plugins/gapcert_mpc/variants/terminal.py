@@ -351,7 +351,7 @@ def handed(task: Task) -> Controller:
         return task.nothing(reason)
     design = replace(made, ends=replace(made.ends, boxes=boxes))
     plans = MpcController(problem.goal, design, {}, "piqp" if options.solver == "auto" else options.solver)
-    x = task.drawn(np.random.default_rng(problem.seed), options.starts)
+    x = task.drawn(np.random.default_rng(problem.seed), task.starts)
     found = HandedController(plans, then, {}, terminal.policy)
     evidence = {
         "horizon": horizon,
@@ -373,4 +373,4 @@ def _planning(task: Task, stages: Stages, F: Array, weights: Weights, reference:
     frame, section = task.frame, passing(stages, F, task.whole)
     lacking = Ends(np.zeros((0, 2, frame.nx)), F)
     made = Design(frame, stages, section, task.rows, weights, reference, task.options.tolerance, ends=lacking)
-    return made, np.asarray(section.support @ made.program().tube(np.zeros((stages.horizon + 1, len(F))))[-1])
+    return made, np.asarray(section.support @ made.program().tube()[-1])
