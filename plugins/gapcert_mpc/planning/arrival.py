@@ -17,7 +17,7 @@ from gapcert_mpc.program.program import Program
 from gapcert_mpc.thresholds import THRESHOLDS
 
 from .engine import Engine
-from .plans import Held, Plan, Pool
+from .plans import Held, Plan, Pool, plan
 
 
 @final
@@ -61,8 +61,11 @@ class Arrival:
 
     def searched(self, x: Array, brief: bool = False) -> Plan | None:
         """A plan along a corridor that mixed-integer programs find from x (frame)."""
-        tried = (self._along(x, *found, None) for found in self.search(x, brief))
-        return next((plan for plan in tried if plan is not None), None)
+        for found in self.search(x, brief):
+            assert found.arrival is not None, "what is searched arrives"
+            if (made := self._along(x, found.x, found.s, found.arrival, None)) is not None:
+                return made
+        return None
 
     def follow(self, x: Array, plan: Plan, age: int) -> Plan | None:
         """The next plan of a run at x that has kept to `plan` for `age` steps and one more; it arrives no later."""
@@ -225,8 +228,8 @@ class Search:
             low[: len(self.plain)][np.isin(self.plain, p.tubes)] = -np.inf
         return cost, A, low, high, kind, scipy.optimize.Bounds(least, most)
 
-    def __call__(self, x: Array, brief: bool = False) -> Iterator[tuple[Array, Array, int]]:
-        """(x̄, s, arrival) from x (frame), candidates whose tubes may be too small; the last are exact where there is one.
+    def __call__(self, x: Array, brief: bool = False) -> Iterator[Plan]:
+        """Plans from x (frame), candidates whose tubes may be too small; the last are exact where there is one.
 
         A tube that depends on the plan makes the program hard, one that is given does not. So it is that of a plan at rest
         first, where none is if there is none for it, then that of the plan that was found, and halfway back.
@@ -234,28 +237,22 @@ class Search:
         p = self.program
         tube = last = p.tube() if p.variable else p.constant
         for i in range(THRESHOLDS.tube_rounds if p.variable else 0):
-            found = self.solved(x, tube)
-            if found is not None:
-                yield found[0], found[1], found[2]
-                last, tube = tube, p.tube(found[3])
+            if (found := self.solved(x, tube)) is not None:
+                yield found
+                away = (np.hstack([found.x[: p.N], found.u]) - p.stages.centre[: p.N]) @ p.F.T
+                last, tube = tube, p.tube(np.abs(away))
             elif not i:
                 return
             else:
                 tube = (last + tube) / 2
         # A tube that does not depend on the plan is exact, and found at once.
         if (not brief or not p.variable) and (exact := self.solved(x, None)) is not None:
-            yield exact[0], exact[1], exact[2]
+            yield exact
 
-    def solved(self, x: Array, tube: Array | None) -> tuple[Array, Array, int, Array] | None:
-        """(x̄, s, arrival, |F(z̄ − ẑ)|) with this tube, (N+1, p), or with its own; None where nothing was found in time."""
-        p, N = self.program, self.N
-        p.begin(x)
+    def solved(self, x: Array, tube: Array | None) -> Plan | None:
+        """With this tube, (N+1, p), or with its own; None where nothing was found in time."""
+        self.program.begin(x)
         if (z := optimum(*self.model(tube), self.nodes)) is None:
             return None
-        arrival = 1 + int(z[self.y0 : self.d0].reshape(N, self.T).sum(axis=1).argmax())
-        s = p.constant
-        if p.variable:
-            s = np.vstack([p.s0, z[p.at["s"][0] :][: N * p.p].reshape(N, p.p)])
-        x, u = z[: (N + 1) * p.n].reshape(N + 1, p.n), z[p.at["u"][0] :][: N * p.m].reshape(N, p.m)
-        away = np.abs((np.hstack([x[:N], u]) - p.stages.centre[:N]) @ p.F.T)
-        return x, s, arrival, away
+        arrival = 1 + int(z[self.y0 : self.d0].reshape(self.N, self.T).sum(axis=1).argmax())
+        return replace(plan(self.program, z, np.zeros(0)), arrival=arrival)
