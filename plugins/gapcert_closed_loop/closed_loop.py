@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, final
 
@@ -334,15 +335,11 @@ class LoopProgress:
     failed: dict[str, int] = field(default_factory=lambda: {"with_gamma": 0, "without_gamma": 0})
     done: tuple[str, ...] = ()
 
-    def during(self, name: str, policy: str) -> Callable[[int, int], None]:
-        """What is called with the step and the failed runs while controller `name` runs under a policy."""
+    def during(self, name: str, policy: str, k: int, now: int) -> None:
+        """Controller `name` is at step k under a policy, and `now` of its runs have failed."""
         text = f"{name.replace('_gamma', ' γ')}, policy {policy}"
-
-        def progress(k: int, now: int) -> None:
-            failed, begun = self.failed | {name: self.failed[name] + now}, (*self.done, name)
-            self.pulse(len(self.done) * self.steps + k, _so_far(failed, begun), text=text)
-
-        return progress
+        failed, begun = self.failed | {name: self.failed[name] + now}, (*self.done, name)
+        self.pulse(len(self.done) * self.steps + k, _so_far(failed, begun), text=text)
 
     def after(self, name: str, failed: int) -> None:
         self.failed[name] += failed
@@ -430,7 +427,7 @@ def compare_loops(
     told = LoopProgress(Pulse(emit, "closed_loop", len(pairs) * steps, "steps"), steps, len(pairs))
     for name, p in pairs:
         own = name == "with_gamma"
-        progress = told.during(name, p)
+        progress = partial(told.during, name, p)
         trace = closed_loop(system, both[name], x0[:taken] if own else x0, steps, p, seed, law, domain, progress=progress)
         told.after(name, int(trace.violation.sum()))
         refused = starts - taken if own and starts_from != "both" else None
