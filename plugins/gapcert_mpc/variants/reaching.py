@@ -12,8 +12,8 @@ from gapcert_mpc.planning.arrival import Arrival
 from gapcert_mpc.planning.design import Design
 from gapcert_mpc.planning.engine import Engine
 from gapcert_mpc.program.corridors import scene
-from gapcert_mpc.program.features import featured, passing
 from gapcert_mpc.program.solver import Name
+from gapcert_mpc.program.tube import passing
 from gapcert_mpc.task import Task
 from gapcert_mpc.thresholds import THRESHOLDS
 
@@ -23,7 +23,7 @@ def reaching(task: Task) -> MpcController:
     problem, options, frame = task.problem, task.options, task.frame
     goal, nx, searches, horizon = problem.goal, frame.nx, options.searches, options.horizon
     task.tell("successors along the model's lines")
-    stages, F = featured(task.nominal, task.zone, horizon, frame, options.majorant == "constant")
+    stages, F = task.nominal.featured(task.zone, horizon, frame, options.majorant == "constant")
     if (reason := task.unbounded(stages)) is not None:
         return task.nothing(reason)
     rows, areas = scene(goal, frame, task.rows, F)

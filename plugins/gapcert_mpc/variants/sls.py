@@ -130,7 +130,10 @@ class SlsSolver:
             working = working | broken
         if status != kernels.SOLVED:
             self.forget()
-            return self._refusal(status, bound)
+            if status == kernels.INFEASIBLE:
+                return SlsRefusal("infeasible", f"rows cannot all hold: every plan costs more than {bound:.3g}", float(bound))
+            why = f"the interior-point method did not converge; plans cost at least {bound:.3g}"
+            return SlsRefusal("unsolved", why, float(bound))
         self.working = working & (multipliers > 1e-6 * multipliers.max(initial=0.0))
         return self._plan(rows, v, V / radii[columns][:, None], columns, count)
 
@@ -204,12 +207,6 @@ class SlsSolver:
         multipliers = np.zeros(working.shape)
         multipliers[side, chosen[row]] = lam
         return status, -(eta @ own), V, multipliers, steps, bound
-
-    def _refusal(self, status: int, bound: float) -> SlsRefusal:
-        bound = float(bound)
-        if status == kernels.INFEASIBLE:
-            return SlsRefusal("infeasible", f"rows cannot all hold: every plan costs more than {bound:.3g}", bound)
-        return SlsRefusal("unsolved", f"the interior-point method did not converge; plans cost at least {bound:.3g}", bound)
 
     def _plan(self, rows: _Rows, v: Array, V: Array, columns: Ints, count: int) -> SlsPlan | SlsRefusal:
         """Its trajectories follow from its inputs, and it is one only where all rows hold on them."""

@@ -20,9 +20,9 @@ from gapcert_mpc.controller import MpcController, loaded
 from gapcert_mpc.planning.design import Design, Ends
 from gapcert_mpc.planning.plans import Held, Plan
 from gapcert_mpc.planning.successive import steady
-from gapcert_mpc.program.features import featured, passing
 from gapcert_mpc.program.linearise import Frame, Stages
 from gapcert_mpc.program.program import Weights
+from gapcert_mpc.program.tube import passing
 from gapcert_mpc.task import Task
 from gapcert_mpc.thresholds import THRESHOLDS
 
@@ -336,13 +336,13 @@ def handed(task: Task) -> Controller:
     then = terminal.controller(problem)
     if not then.wins:
         return task.nothing(f"the winning set in which plans would end is empty: {then.evidence['reason']}")
-    stages, F = featured(task.nominal, task.zone, horizon, frame, options.majorant != "affine")
+    stages, F = task.nominal.featured(task.zone, horizon, frame, options.majorant != "affine")
     if (reason := task.unbounded(stages) or task.unstable(stages)) is not None:
         return task.nothing(reason)
     weights, reference = task.weights(stages), steady(task.nominal, frame, *task.wanted())[0]
     made, half = _planning(task, stages, F, weights, reference)
     if options.majorant == "auto" and not (half < THRESHOLDS.small_tube).all():
-        made, half = _planning(task, *featured(task.nominal, task.zone, horizon, frame, False), weights, reference)
+        made, half = _planning(task, *task.nominal.featured(task.zone, horizon, frame, False), weights, reference)
     assert made.ends is not None
     boxes = ends(then, frame, 2 * (half[:nx] + tolerance), reference[:nx], terminal.boxes)
     if not len(boxes):
