@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
@@ -66,11 +67,8 @@ def audited(failed: Bools, beta: float, steps: int, policies: tuple[str, ...]) -
 def largest(v: int, n: int, beta: float) -> float:
     """The probability that v of n draws show at confidence 1 − β not to be exceeded: the smallest ε of four digits, rounded up,
     with P(Bin(n, ε) ≤ v) ≤ β (Clopper and Pearson 1934)."""
-    low, high, goal = 0, 10_000, Decimal(beta)
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if missed(v, n, middle / 10_000) <= goal else (middle, high)
-    return high / 10_000
+    goal = Decimal(beta)
+    return (1 + bisect_left(range(1, 10_000), True, key=lambda k: missed(v, n, k / 10_000) <= goal)) / 10_000
 
 
 def loop_failures(summary: Mapping[str, Any], claim: str = "") -> list[str]:
