@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, final
+from typing import Any, final
 
 from pydantic import Field
 
 from gapcert.plugin import POLICIES, Build, NoStart, Outcome, Policy, SpecSection, Stages, Study, beta_of, of_config
 from gapcert.plugin import sections as s
 
-from .closed_loop import ClosedLoop, compare_loops
+from .closed_loop import ClosedLoop, StartsFrom, compare_loops
 from .loop_audit import Oracle, loop_failures
 
 
@@ -26,9 +26,7 @@ class ClosedLoopConfig(s.Section):
     starts: s.Count = Field(100, description="runs per policy, at most")
     confidence: s.Probability = Field(0.999, description="1 − β of what the runs with γ show")
     policies: list[Policy] = Field(list(POLICIES), min_length=1, description="which valid inputs are applied, in turn")
-    starts_from: Literal["both", "without_gamma"] = Field(
-        "both", description="where both controllers win, or where the one without γ does"
-    )
+    starts_from: StartsFrom = Field("both", description="where both controllers win, or where the one without γ does")
     seed: s.Whole | None = Field(None, description="of the starts; default: the spec's")
 
 

@@ -9,6 +9,7 @@ from pydantic import ConfigDict, Field
 from gapcert.plugin import Section
 
 Quantity = float | str
+Choice = Literal["auto", "osqp", "piqp", "clarabel"]
 Weight = Annotated[float, Field(ge=0)]
 
 
@@ -52,7 +53,7 @@ class MpcConfig(Section):
         description="states and inputs that are wanted, or {at: [[time, value], …]}; default: the middle of the goal, and rest",
     )
     weights: dict[str, Weight] = Field(default_factory=dict, description="costs per state and input; default: 1")
-    solver: Literal["auto", "osqp", "piqp", "clarabel"] = Field(
+    solver: Choice = Field(
         "auto", description="who solves the quadratic program first; auto: who needs less work on sample runs"
     )
     tolerance: float = Field(

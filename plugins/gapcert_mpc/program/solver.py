@@ -11,7 +11,6 @@ import scipy.sparse as sp
 from gapcert.plugin import Array, MissingDependency, UsageError
 
 Name = Literal["osqp", "piqp", "clarabel"]
-Choice = Literal["auto", "osqp", "piqp", "clarabel"]
 Status = Literal["solved", "infeasible", "unfinished"]
 
 

@@ -13,10 +13,11 @@ import scipy.sparse.linalg
 from scipy.linalg.blas import dtbsv
 
 from gapcert.plugin import Array
+from gapcert_mpc.config import Choice
 from gapcert_mpc.thresholds import THRESHOLDS
 
 from .program import Program
-from .solver import Answer, Choice, Name, Osqp, Piqp
+from .solver import Answer, Name, Osqp, Piqp
 
 
 @final
