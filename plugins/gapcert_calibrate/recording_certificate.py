@@ -21,6 +21,7 @@ from gapcert.plugin import (
     Domain,
     GapFamily,
     GapProblem,
+    Ints,
     LipschitzEstimator,
     LipschitzProblem,
     Model,
@@ -47,7 +48,6 @@ from gapcert_recordings import Transitions
 
 from .route import CalibratedGap, NoConstants, constant, ends, scale_of
 
-Index = npt.NDArray[np.intp]
 CALLER = "calibration"
 FIT = 1 / 3  # the share of windows that a fit is given
 _FITTED = 300  # transitions that a fit is given: neighbours in time say nearly the same, and scores are made again with each
@@ -65,7 +65,7 @@ class Windows:
     t: Array
     z: Array
     r: Array
-    window: Index
+    window: Ints
     rows: int
     skipped: int
     outside: int
@@ -79,7 +79,7 @@ class Windows:
         """The rows of which nothing is said, by reason."""
         return {"all": self.rows, "no_transition": self.skipped, "outside": self.outside}
 
-    def of(self, windows: Index) -> Windows:
+    def of(self, windows: Ints) -> Windows:
         rows = np.isin(self.window, windows)
         own = self.t[rows], self.z[rows], self.r[rows], self.window[rows]
         return Windows(*own, self.rows, self.skipped, self.outside)

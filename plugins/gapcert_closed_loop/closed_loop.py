@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Literal, final
 
 import numpy as np
-import numpy.typing as npt
 
 from gapcert.plugin import (
     POLICIES,
@@ -18,6 +17,7 @@ from gapcert.plugin import (
     Controller,
     Domain,
     Emit,
+    Ints,
     Law,
     NoStart,
     Policy,
@@ -59,11 +59,11 @@ class Trace:
     stranded: Bools
     left_goal: Bools
     reached: Bools
-    counted: npt.NDArray[np.int64]
+    counted: Ints
     broken: Bools
     visited: int = 0
     strange: int = 0
-    fallbacks: npt.NDArray[np.int64] | None = None
+    fallbacks: Ints | None = None
     learned: Mapping[str, Array] | None = None
     hidden: Array | None = None
 
@@ -173,8 +173,8 @@ def _runs(
 def _responses(
     controller: Controller,
     x: Array,
-    memory: npt.NDArray[np.int64],
-    alive: npt.NDArray[np.intp],
+    memory: Ints,
+    alive: Ints,
     policy: Policy,
     seed: int,
     k: int,
@@ -198,7 +198,7 @@ def _refuse_broken(domain: Domain, x: Array, u: Array) -> None:
         )
 
 
-def _judge(controller: Controller, x: Array, memory: npt.NDArray[np.int64]) -> dict[str, Bools]:
+def _judge(controller: Controller, x: Array, memory: Ints) -> dict[str, Bools]:
     reached = controller.over(x, memory)
     stranded = ~controller.keeps(x, memory) & ~reached
     return {"reached": reached, "stranded": stranded, "left_goal": ~controller.goal.holds(x)}

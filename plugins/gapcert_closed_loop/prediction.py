@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert.plugin import TURN, Array, Policy, System, pretty, turned
+from gapcert.plugin import TURN, Array, Bools, Policy, System, pretty, turned
 
 if TYPE_CHECKING:
     from gapcert.plugin import Controller
@@ -39,7 +38,7 @@ class Ahead:
     error: Array
     low: Array
     high: Array
-    kept: npt.NDArray[np.bool_]
+    kept: Bools
 
 
 def foreseen(controller: Controller, x: Array, policy: Policy) -> tuple[tuple[Foreseen, ...], Ahead | None]:

@@ -21,8 +21,7 @@ from gapcert_mpc.task import Task
 from gapcert_mpc.thresholds import THRESHOLDS
 
 from .regulation import regulating
-from .sls import SlsSolver
-from .sls_problem import LtvProblem, SlsPlan
+from .sls import LtvProblem, SlsPlan, SlsSolver
 
 
 @final
