@@ -118,10 +118,10 @@ class Alone:
         self.program = p = design.program()
         self.later, self.last = p.shifted(), None
         own = {"rho": design.tuning.rho, "alpha": design.tuning.alpha} if name == "osqp" else {}
-        self.solver = solver(name, p.P, p.q, p.A, p.low, p.high, p.tolerance, **own)
+        self.solver = solver(name, p.qp, p.tolerance, **own)
         if plain:
             made = self.solver.osqp = osqp.OSQP()
-            made.setup(p.P, p.q, p.A, p.low, p.high, verbose=False, eps_abs=p.tolerance / 2, eps_rel=0.0)
+            made.setup(*p.qp, verbose=False, eps_abs=p.tolerance / 2, eps_rel=0.0)
         elif name == "osqp":
             self.solver.osqp.update_settings(max_iter=4000)
 
@@ -132,7 +132,7 @@ class Alone:
     def step(self, x: Array) -> Array:
         p = self.program
         p.begin(x)
-        self.solver.update(low=p.low, high=p.high)
+        self.solver.update(p.qp)
         guess = self.later[2:] if self.last is None else (self.last.z[self.later[0]], self.last.y[self.later[1]])
         self.last = self.solver.solve(*guess)
         return self.last.z

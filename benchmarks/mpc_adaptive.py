@@ -25,7 +25,7 @@ from gapcert.contracts.plugins.events import silent
 from gapcert.run.build import Build
 from gapcert_cells.testing import Band
 from gapcert_mpc.synthesizer import Mpc
-from gapcert_mpc.variants.membership import Membership
+from gapcert_mpc.variants.parameters import Membership
 
 SPEC = Path(__file__).parents[1] / "specs" / "pendulum_adaptive.yaml"
 TRUE = 1.3
@@ -64,7 +64,7 @@ def bullet(options: argparse.Namespace) -> list[harness.Row]:
         backend, problem, synthesizer = made(Path(folder))
     ours = synthesizer.synthesize(problem)
     fixed = gc.registry().build("synthesizer", "mpc", gc.registry().config("synthesizer", "mpc")(
-        horizon=synthesizer.horizon, reference=synthesizer.reference, adapt=synthesizer.adapt, levels=0
+        horizon=synthesizer.options.horizon, reference=synthesizer.options.reference, adapt=synthesizer.options.adapt, levels=0
     ))  # fmt: skip
     other = fixed.synthesize(problem)
     n, steps = (10, 40) if options.quick else (50, 150)
@@ -92,7 +92,7 @@ def bullet(options: argparse.Namespace) -> list[harness.Row]:
 def domains(synthesizer: Mpc, problem: gc.SynthesisProblem, options: argparse.Namespace) -> list[harness.Row]:
     """What is won where less is unknown from the start; and what a level, and an update, cost."""
     ours = synthesizer.synthesize(problem)
-    family, plain = ours.levels.family, Mpc(synthesizer.horizon, synthesizer.reference)
+    family, plain = ours.levels.family, Mpc(horizon=synthesizer.options.horizon, reference=synthesizer.options.reference)
     whole, out, x = float(ours.evidence["domain_fraction"]), [], ours.draw(64, np.random.default_rng(1))
     for half in (0.2, 0.1, 0.05, 0.01):
         box = gc.Interval(np.array([TRUE - half]), np.array([min(TRUE + half, 1.4)]))
@@ -120,7 +120,9 @@ def adversaries(options: argparse.Namespace) -> list[harness.Row]:
     with tempfile.TemporaryDirectory() as folder:
         _, problem, synthesizer = made(Path(folder))
     problem = replace(problem, gap=Band(-WIDE, WIDE))
-    c = Mpc(synthesizer.horizon, synthesizer.reference, adapt=synthesizer.adapt).synthesize(problem)
+    c = Mpc(
+        horizon=synthesizer.options.horizon, reference=synthesizer.options.reference, adapt=synthesizer.options.adapt
+    ).synthesize(problem)
     model, rng, n = problem.model, np.random.default_rng(2), 20 if options.quick else 100
     truth = rng.choice([0.6, 0.8, 1.0, 1.2, 1.3, 1.4], size=n)
 

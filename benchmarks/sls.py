@@ -23,8 +23,7 @@ import numpy as np
 from harness import Row, alternate, main, row
 from sls_twin import Twin
 
-from gapcert_mpc.variants.sls import SlsSolver
-from gapcert_mpc.variants.sls_problem import LtvProblem, SlsPlan
+from gapcert_mpc.variants.sls import LtvProblem, SlsPlan, SlsSolver
 
 N, TAU = 20, 0.05
 PEER = "cvxpy, Clarabel"

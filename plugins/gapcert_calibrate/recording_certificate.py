@@ -21,6 +21,7 @@ from gapcert.plugin import (
     Domain,
     GapFamily,
     GapProblem,
+    Ints,
     LipschitzEstimator,
     LipschitzProblem,
     Model,
@@ -43,12 +44,76 @@ from gapcert.plugin import (
     write_atomic,
 )
 from gapcert_monitor import Certified, Check, Monitor, check
+from gapcert_recordings import Transitions
 
-from .route import CalibratedGap, NoConstants, ends, scale_of
-from .windows import CALLER, Windows
+from .route import CalibratedGap, NoConstants, constant, ends, scale_of
 
+CALLER = "calibration"
 FIT = 1 / 3  # the share of windows that a fit is given
 _FITTED = 300  # transitions that a fit is given: neighbours in time say nearly the same, and scores are made again with each
+
+
+@final
+@dataclass(frozen=True)
+class Windows:
+    """A recording cut into windows, the units of a calibration.
+
+    Transitions in Z: when they begin (n,) in s, z (n, nz), r (n, nx), and the number of the window that each lies in (n,).
+    Of `rows` rows, `skipped` begin no transition, and `outside` begin one that is outside Z or in no whole window.
+    """
+
+    t: Array
+    z: Array
+    r: Array
+    window: Ints
+    rows: int
+    skipped: int
+    outside: int
+
+    def __len__(self) -> int:
+        """How many windows there are."""
+        return len(np.unique(self.window))
+
+    @property
+    def unused(self) -> dict[str, int]:
+        """The rows of which nothing is said, by reason."""
+        return {"all": self.rows, "no_transition": self.skipped, "outside": self.outside}
+
+    def of(self, windows: Ints) -> Windows:
+        rows = np.isin(self.window, windows)
+        own = self.t[rows], self.z[rows], self.r[rows], self.window[rows]
+        return Windows(*own, self.rows, self.skipped, self.outside)
+
+    @classmethod
+    def cut(cls, model: Model, recording: Recording, domain: Domain, length: float | None) -> Windows:
+        """Transitions that begin in Z and lie in one whole window; windows are numbered among those that have any.
+
+        length: in s; None: a whole trajectory. UsageError where no transition is left.
+        """
+        steps = Transitions.of(model, recording, CALLER)
+        if length is not None and not length >= model.period:
+            raise UsageError(f"{CALLER}: window = {length} s; expected at least the period of {model.period:g} s")
+        number, keep = np.zeros(len(steps), dtype=np.int64), np.ones(len(steps), dtype=bool)
+        if length is not None:
+            ends = [(float(np.nanmin(tr.t)), float(np.nanmax(tr.t))) for tr in recording.trajectories]
+            first, last = (np.array(side)[steps.trajectory] for side in zip(*ends, strict=True))
+            slack = 1e-9 * length
+            number = np.floor((steps.t - first + slack) / length).astype(np.int64)
+            begin = first + number * length
+            keep = (steps.t + model.period <= begin + length + slack) & (begin + length <= last + slack)
+        known = Certified(model, domain.zone, lambda z: (z, z))
+        z = known.points(steps.x, steps.u)
+        whole = int(keep.sum())
+        keep &= domain.contains(z)
+        if not keep.any():
+            short = f"no trajectory is as long as a window of {length} s; take shorter ones"
+            away = "no transition of a whole window begins in the domain; take a larger one"
+            raise UsageError(f"{CALLER}: {away if whole else short}")
+        _, which = np.unique(np.stack([steps.trajectory, number], axis=1)[keep], axis=0, return_inverse=True)
+        r = known.residual(steps.x[keep], steps.u[keep], steps.x_next[keep])
+        left = int((~keep).sum())
+        index = np.asarray(which, dtype=np.intp).reshape(-1)
+        return cls(steps.t[keep], z[keep], r, index, len(steps) + steps.skipped, steps.skipped, left)
 
 
 @final
@@ -218,14 +283,17 @@ def calibrate_recording(
     problem = _problem(model, domain, own, family, lipschitz, predictor, seed)
     made = family or registry().build("gap_family", "envelope")
     gap, scale = made.fit(problem), scale_of(problem)
-    low, high = ends(gap, held.z)
-    each = order_statistics.worst(order_statistics.scores(held.r, low, high, scale), held.window)
+
+    def scored(low: Array, high: Array, scale: Array) -> Array:
+        return order_statistics.worst(order_statistics.scores(held.r, low, high, scale), held.window)
+
+    each = scored(*ends(gap, held.z), scale)
     rank = order_statistics.unit_rank(len(each), violation, beta)
     score = order_statistics.ranked(each, rank)
     band = CalibratedGap(gap, order_statistics.widening(score, scale), problem.arithmetic)
     claim = Claim("statistical", violation, beta, order_statistics.WINDOWS if beta is None else order_statistics.DRAWN_WINDOWS)
     said = _sentences(model, domain, window, found, len(each), rank, violation, beta)
-    states = figures(band, problem, model, held.z, held.r, _constant(band, problem, held, rank))
+    states = figures(band, problem, model, held.z, held.r, constant(band, problem, held.z, rank, scored))
     versions = {"gapcert": __version__, "numpy": np.__version__, "python": platform.python_version()}
     return CalibratedRecording(
         band, problem, model, claim, said, units, own, held, scale, rank, score, each, states, versions=versions
@@ -245,16 +313,6 @@ def _dealt(units: int, fit: float, violation: float, beta: float | None, window:
         f"{total} in all, and {left} allow {order_statistics.smallest(left, beta):g} at best; record more, take shorter "
         f"windows if these are {'exchangeable' if beta is None else 'independent'} too, or ask for a larger violation"
     )
-
-
-def _constant(gap: CalibratedGap, problem: GapProblem, held: Windows, rank: int) -> Array:
-    """(nx,) what the held windows make of a constant, with the largest |r_i| of the samples as scale."""
-    if gap.form["form"] == "constant":
-        return np.asarray(gap.gamma(held.z[:1])[0])
-    size = np.maximum(np.abs(problem.samples.r).max(axis=0), problem.arithmetic)
-    none = np.zeros_like(held.r)
-    each = order_statistics.worst(order_statistics.scores(held.r, none, none, size), held.window)
-    return np.asarray(order_statistics.widening(order_statistics.ranked(each, rank), size) + problem.arithmetic)
 
 
 def _problem(

@@ -1,13 +1,14 @@
 """Route calibrate: any gap function, moved outwards or inwards until fresh points say how often it fails.
 
-The claim rests on an order statistic of scores (`calibration`) and on no constants: whatever the function is, it was fixed
+The claim rests on an order statistic of scores (`order_statistics`) and on no constants: whatever the function is, it was fixed
 before the points were drawn.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, final
 
 import numpy as np
@@ -42,7 +43,7 @@ from gapcert.plugin import (
 )
 from gapcert_functions import DominatingGap
 
-from .noise_draws import NoiseDraws, again, drawn
+from .stochastic_backend import NoiseDraws, again, drawn
 
 
 @final
@@ -143,16 +144,6 @@ class Calibration(Record):
         known = {"predictor.calibration": problem.predictor(self.z)} if problem.predictor.kind == "model" else {}
         return {"calibration.scale": self.scale, **known}
 
-    def constant(self, gap: GapFunction, problem: GapProblem) -> Array:
-        """(nx,) what the same points make of a constant, with the largest |r_i| of the samples as scale."""
-        if gap.form["form"] == "constant":
-            return np.asarray(gap.gamma(self.z[:1])[0])
-        size = np.maximum(np.abs(problem.samples.r).max(axis=0), problem.arithmetic)
-        none = np.zeros_like(self.r[0])
-        each = np.max([order_statistics.scores(r, none, none, size) for r in self.r], axis=0)
-        q = order_statistics.ranked(each, len(self.z) - self.exceedances)
-        return np.asarray(order_statistics.widening(q, size) + problem.arithmetic)
-
     def sentences(self, problem: GapProblem, audited: Audit, model: Model, gate: Gate) -> list[str]:
         """What the claim rests on."""
         n, domain = len(self.z), problem.domain
@@ -216,8 +207,7 @@ class Calibrate(Route):
         names = [f"calibration-{k}", *(f"calibration-{k}.{draw}" for draw in range(1, repeats))]
         r = np.stack([own.collect(name, Points(z)) for own, name in zip(stores, names, strict=True)])
         scale = scale_of(problem)
-        low, high = ends(gap, z)
-        each = np.max([order_statistics.scores(one, low, high, scale) for one in r], axis=0)
+        each = scored(r, *ends(gap, z), scale)
         q = order_statistics.ranked(each, n - m)
         w = order_statistics.widening(q, scale)
         return CalibratedGap(gap, w, problem.arithmetic), Calibration(z, r, k, scale, m, q, w, _noisy(store.residual.backend))
@@ -231,7 +221,8 @@ class Calibrate(Route):
 
     def yardsticks(self, gap: GapFunction, problem: GapProblem, record: Record | None, z: Array) -> tuple[Array, Array | None]:
         assert isinstance(record, Calibration), "its band has one"
-        return record.constant(gap, problem), None
+        rank = len(record.z) - record.exceedances
+        return constant(gap, problem, record.z, rank, partial(scored, record.r)), None
 
 
 def ends(gap: GapFunction, z: Array) -> tuple[Array, Array]:
@@ -243,6 +234,26 @@ def scale_of(problem: GapProblem) -> Array:
     """(nx,) mean |r_i − p_i| over the samples, or the resolution where that is more."""
     tiny = np.finfo(float).tiny
     return np.asarray(np.maximum(np.maximum(np.abs(problem.remainder).mean(axis=0), problem.arithmetic), tiny))
+
+
+def scored(r: Array, low: Array, high: Array, scale: Array) -> Array:
+    """(n,) scores of points with residuals r (draws, n, nx), the largest of its draws each."""
+    return np.asarray(np.max([order_statistics.scores(one, low, high, scale) for one in r], axis=0))
+
+
+def constant(
+    gap: GapFunction, problem: GapProblem, z: Array, rank: int, scored: Callable[[Array, Array, Array], Array]
+) -> Array:
+    """(nx,) what the points z of a calibration make of a constant, with the largest |r_i| of the samples as scale.
+
+    scored: what (l, u) at the points and a scale make of their scores, of which the one of `rank` counts.
+    """
+    if gap.form["form"] == "constant":
+        return np.asarray(gap.gamma(z[:1])[0])
+    size = np.maximum(np.abs(problem.samples.r).max(axis=0), problem.arithmetic)
+    none = np.zeros((len(z), len(size)))
+    q = order_statistics.ranked(scored(none, none, size), rank)
+    return np.asarray(order_statistics.widening(q, size) + problem.arithmetic)
 
 
 def _noisy(system: Any) -> bool:

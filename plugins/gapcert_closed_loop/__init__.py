@@ -9,9 +9,8 @@ from gapcert.plugin import LazyPackage, homes
 _HOME = homes(
     {
         "gapcert_closed_loop.closed_loop": "ClosedLoop Trace closed_loop",
-        "gapcert_closed_loop.failures": "broken_sentence",
-        "gapcert_closed_loop.parameter_sets": "Learned figures",
-        "gapcert_closed_loop.prediction": "Ahead Foreseen followed foreseen",
+        "gapcert_closed_loop.loop_audit": "broken_sentence",
+        "gapcert_closed_loop.prediction": "Ahead Foreseen Learned figures followed foreseen",
     }
 )
 

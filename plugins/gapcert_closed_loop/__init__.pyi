@@ -1,10 +1,10 @@
 from gapcert_closed_loop.closed_loop import ClosedLoop as ClosedLoop
 from gapcert_closed_loop.closed_loop import Trace as Trace
 from gapcert_closed_loop.closed_loop import closed_loop as closed_loop
-from gapcert_closed_loop.failures import broken_sentence as broken_sentence
-from gapcert_closed_loop.parameter_sets import Learned as Learned
-from gapcert_closed_loop.parameter_sets import figures as figures
+from gapcert_closed_loop.loop_audit import broken_sentence as broken_sentence
 from gapcert_closed_loop.prediction import Ahead as Ahead
 from gapcert_closed_loop.prediction import Foreseen as Foreseen
+from gapcert_closed_loop.prediction import Learned as Learned
+from gapcert_closed_loop.prediction import figures as figures
 from gapcert_closed_loop.prediction import followed as followed
 from gapcert_closed_loop.prediction import foreseen as foreseen

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert.plugin import POLICIES as POLICIES
 from gapcert.plugin import (
+    POLICIES,
     Array,
     Bools,
     Controller,
     Domain,
     Emit,
+    Ints,
     Law,
+    NoStart,
     Policy,
     Pulse,
     System,
@@ -32,10 +34,7 @@ from gapcert.plugin import (
 )
 
 from .loop_audit import Oracle, audited
-from .parameter_sets import summary as learned_summary
-from .progress import LoopProgress
-from .starts import draw_starts as draw_starts
-from .starts import taken_first
+from .prediction import summary as learned_summary
 
 SHARES = 4  # shares per worker; chosen, not measured
 StartsFrom = Literal["both", "without_gamma"]
@@ -60,102 +59,17 @@ class Trace:
     stranded: Bools
     left_goal: Bools
     reached: Bools
-    counted: npt.NDArray[np.int64]
+    counted: Ints
     broken: Bools
     visited: int = 0
     strange: int = 0
-    fallbacks: npt.NDArray[np.int64] | None = None
+    fallbacks: Ints | None = None
     learned: Mapping[str, Array] | None = None
     hidden: Array | None = None
 
     @property
     def violation(self) -> Bools:
         return np.asarray(self.stranded | self.left_goal)
-
-
-@final
-@dataclass(frozen=True)
-class Count:
-    """One row of the table of policies; `controller` is `with_gamma` or `without_gamma`.
-
-    Only goals that end have `reached`, runs that did; reach-and-stay has `settled`, runs that at the last step were where
-    they may stay in the target for ever; a goal to be met again and again has `visits`, the fewest of any run that did not
-    break.
-
-    refused: of the starts that were drawn where the controller without γ wins, those from which the one with γ does not start;
-    no run is made from them. fallbacks: steps that went on with a plan of before.
-
-    broken_promises: steps that did not end where the controller had promised. `refuted` says which part of the promise they
-    refute, of steps_held steps outside_gap lie outside [l, u]: see `replay.Oracle.judge`.
-    """
-
-    policy: Policy
-    controller: str
-    starts: int
-    steps: int
-    violations: int
-    stranded: int
-    left_goal: int
-    broken_promises: int
-    refused: int | None = None
-    fallbacks: int | None = None
-    reached: int | None = None
-    settled: int | None = None
-    visits: int | None = None
-    steps_held: int | None = None
-    outside_gap: int | None = None
-    refuted: Mapping[str, int] | None = None
-
-    def to_data(self) -> dict[str, Any]:
-        """JSON-able; what does not apply is absent."""
-        return {k: v for k, v in asdict(self).items() if v is not None}
-
-
-@final
-@dataclass(frozen=True)
-class ClosedLoop:
-    """Both controllers from the same starts under every policy; the traces are those of the headline policy.
-
-    `hidden_outside`: the share of the hidden states visited with γ, under all policies, that the certificate certainly did not
-    cover; None where it drew none. claim: what the runs with γ earn as an audit.
-    skipped: policies that were asked for, and that a controller, or neither, does not know.
-    """
-
-    policy: Policy
-    rows: tuple[Count, ...]
-    with_gamma: Trace
-    without_gamma: Trace
-    hidden_outside: float | None = None
-    claim: Mapping[str, Any] = field(default_factory=dict)
-    skipped: tuple[str, ...] = ()
-
-    def count(self, controller: str, policy: Policy | None = None) -> Count:
-        """The row of a controller under a policy (default: the headline policy)."""
-        wanted = (controller, policy or self.policy)
-        for row in self.rows:
-            if (row.controller, row.policy) == wanted:
-                return row
-        raise UsageError(f"closed loop: no row for {wanted[0]} under '{wanted[1]}'")
-
-    def save(self, folder: Path) -> None:
-        """Write `closed_loop.npz`: x, u and broken of the headline runs of both controllers, for a replay with those saved."""
-        both = {"with_gamma": self.with_gamma, "without_gamma": self.without_gamma}
-        arrays = {f"{name}_{part}": getattr(trace, part) for name, trace in both.items() for part in ("x", "u", "broken")}
-        write_atomic(folder / "closed_loop.npz", npz_bytes(arrays, compress=True))
-
-    def summary(self) -> dict[str, Any]:
-        """JSON-able: the two headline rows, and all of them."""
-
-        def headline(controller: str) -> dict[str, Any]:
-            return {k: v for k, v in self.count(controller).to_data().items() if k != "controller"}
-
-        both = {name: headline(name) for name in ("with_gamma", "without_gamma")}
-        outside = {} if self.hidden_outside is None else {"hidden_outside": self.hidden_outside}
-        more: dict[str, Any] = {"claim": dict(self.claim)} if self.claim else {}
-        more |= {"skipped": list(self.skipped)} if self.skipped else {}
-        if (known := self.with_gamma.learned) is not None:
-            more["learned"] = learned_summary(self.with_gamma.x, known)
-        return {**both, **outside, **more, "policies": [row.to_data() for row in self.rows]}
 
 
 def closed_loop(
@@ -259,8 +173,8 @@ def _runs(
 def _responses(
     controller: Controller,
     x: Array,
-    memory: npt.NDArray[np.int64],
-    alive: npt.NDArray[np.intp],
+    memory: Ints,
+    alive: Ints,
     policy: Policy,
     seed: int,
     k: int,
@@ -284,10 +198,163 @@ def _refuse_broken(domain: Domain, x: Array, u: Array) -> None:
         )
 
 
-def _judge(controller: Controller, x: Array, memory: npt.NDArray[np.int64]) -> dict[str, Bools]:
+def _judge(controller: Controller, x: Array, memory: Ints) -> dict[str, Bools]:
     reached = controller.over(x, memory)
     stranded = ~controller.keeps(x, memory) & ~reached
     return {"reached": reached, "stranded": stranded, "left_goal": ~controller.goal.holds(x)}
+
+
+def draw_starts(controllers: Sequence[Controller], n: int, seed: int) -> Array:
+    """n states, uniform on the intersection of the controllers' domains but for the target; NoStart where there are too few."""
+    rng = np.random.default_rng(seed)
+    found: list[Array] = []
+    missing = n
+    for _ in range(200):
+        # Where an answer is dear, not many more are asked for than are needed.
+        x = controllers[0].draw(max(4 * n, 5 * controllers[0].resolution), rng)
+        for controller in controllers:
+            x = x[controller.contains(x)]
+            x = x[~controller.over(x, controller.start(x))]
+        found.append(x[:missing])
+        missing -= len(found[-1])
+        if not missing:
+            return np.concatenate(found)
+    reasons = [str(c.evidence["reason"]) for c in controllers if "reason" in c.evidence]
+    why = f" ({reasons[0]})" if reasons else ""
+    finer = "smaller cells, " if any("winning_cells" in c.evidence for c in controllers) else ""
+    raise NoStart(
+        f"closed loop: {n - missing} of {n} starts found where all controllers win{why}, the target left out; enlarge "
+        f"their domains ({finer}a longer period, a wider goal)"
+    )
+
+
+def taken_first(with_gamma: Controller, without_gamma: Controller, n: int, seed: int) -> tuple[Array, int]:
+    """n starts drawn where the controller without γ wins, those first that the one with γ takes, and how many these are."""
+    x = draw_starts((without_gamma,), n, seed)
+    takes = with_gamma.contains(x)
+    if not takes.any():
+        raise NoStart(
+            f"closed loop: the controller with γ starts from none of {n} states drawn where the one without γ wins; enlarge "
+            f"its domain, or leave out `starts_from`"
+        )
+    return np.concatenate([x[takes], x[~takes]]), int(takes.sum())
+
+
+@final
+@dataclass(frozen=True)
+class Count:
+    """One row of the table of policies; `controller` is `with_gamma` or `without_gamma`.
+
+    Only goals that end have `reached`, runs that did; reach-and-stay has `settled`, runs that at the last step were where
+    they may stay in the target for ever; a goal to be met again and again has `visits`, the fewest of any run that did not
+    break.
+
+    refused: of the starts that were drawn where the controller without γ wins, those from which the one with γ does not start;
+    no run is made from them. fallbacks: steps that went on with a plan of before.
+
+    broken_promises: steps that did not end where the controller had promised. `refuted` says which part of the promise they
+    refute, of steps_held steps outside_gap lie outside [l, u]: see `Oracle.judge`.
+    """
+
+    policy: Policy
+    controller: str
+    starts: int
+    steps: int
+    violations: int
+    stranded: int
+    left_goal: int
+    broken_promises: int
+    refused: int | None = None
+    fallbacks: int | None = None
+    reached: int | None = None
+    settled: int | None = None
+    visits: int | None = None
+    steps_held: int | None = None
+    outside_gap: int | None = None
+    refuted: Mapping[str, int] | None = None
+
+    def to_data(self) -> dict[str, Any]:
+        """JSON-able; what does not apply is absent."""
+        return {k: v for k, v in asdict(self).items() if v is not None}
+
+
+@final
+@dataclass(frozen=True)
+class ClosedLoop:
+    """Both controllers from the same starts under every policy; the traces are those of the headline policy.
+
+    `hidden_outside`: the share of the hidden states visited with γ, under all policies, that the certificate certainly did not
+    cover; None where it drew none. claim: what the runs with γ earn as an audit.
+    skipped: policies that were asked for, and that a controller, or neither, does not know.
+    """
+
+    policy: Policy
+    rows: tuple[Count, ...]
+    with_gamma: Trace
+    without_gamma: Trace
+    hidden_outside: float | None = None
+    claim: Mapping[str, Any] = field(default_factory=dict)
+    skipped: tuple[str, ...] = ()
+
+    def count(self, controller: str, policy: Policy | None = None) -> Count:
+        """The row of a controller under a policy (default: the headline policy)."""
+        wanted = (controller, policy or self.policy)
+        for row in self.rows:
+            if (row.controller, row.policy) == wanted:
+                return row
+        raise UsageError(f"closed loop: no row for {wanted[0]} under '{wanted[1]}'")
+
+    def save(self, folder: Path) -> None:
+        """Write `closed_loop.npz`: x, u and broken of the headline runs of both controllers, for a replay with those saved."""
+        both = {"with_gamma": self.with_gamma, "without_gamma": self.without_gamma}
+        arrays = {f"{name}_{part}": getattr(trace, part) for name, trace in both.items() for part in ("x", "u", "broken")}
+        write_atomic(folder / "closed_loop.npz", npz_bytes(arrays, compress=True))
+
+    def summary(self) -> dict[str, Any]:
+        """JSON-able: the two headline rows, and all of them."""
+
+        def headline(controller: str) -> dict[str, Any]:
+            return {k: v for k, v in self.count(controller).to_data().items() if k != "controller"}
+
+        both = {name: headline(name) for name in ("with_gamma", "without_gamma")}
+        outside = {} if self.hidden_outside is None else {"hidden_outside": self.hidden_outside}
+        more: dict[str, Any] = {"claim": dict(self.claim)} if self.claim else {}
+        more |= {"skipped": list(self.skipped)} if self.skipped else {}
+        if (known := self.with_gamma.learned) is not None:
+            more["learned"] = learned_summary(self.with_gamma.x, known)
+        return {**both, **outside, **more, "policies": [row.to_data() for row in self.rows]}
+
+
+@dataclass
+class LoopProgress:
+    """The progress of all policies' runs, and how many of these have failed."""
+
+    pulse: Pulse
+    steps: int
+    policies: int
+    failed: dict[str, int] = field(default_factory=lambda: {"with_gamma": 0, "without_gamma": 0})
+    done: tuple[str, ...] = ()
+
+    def during(self, name: str, policy: str, k: int, now: int) -> None:
+        """Controller `name` is at step k under a policy, and `now` of its runs have failed."""
+        text = f"{name.replace('_gamma', ' γ')}, policy {policy}"
+        failed, begun = self.failed | {name: self.failed[name] + now}, (*self.done, name)
+        self.pulse(len(self.done) * self.steps + k, _so_far(failed, begun), text=text)
+
+    def after(self, name: str, failed: int) -> None:
+        self.failed[name] += failed
+        self.done += (name,)
+        text = f"{len(self.done)} of {self.policies} policies done"
+        self.pulse(len(self.done) * self.steps, _so_far(self.failed, self.done), text=text)
+
+
+def _so_far(failed: Mapping[str, int], begun: Sequence[str]) -> dict[str, Any]:
+    """The runs that failed, and over how many policies; `begun`: the controller of each policy that counts in these sums."""
+    counts = {"runs failed with γ": failed["with_gamma"], "without": failed["without_gamma"]}
+    own, other = (begun.count(name) for name in ("with_gamma", "without_gamma"))
+    if max(own, other) < 2:
+        return counts
+    return counts | {"over": f"{own} policies" if own == other or not other else f"{own} and {other} policies"}
 
 
 def _count(
@@ -360,7 +427,7 @@ def compare_loops(
     told = LoopProgress(Pulse(emit, "closed_loop", len(pairs) * steps, "steps"), steps, len(pairs))
     for name, p in pairs:
         own = name == "with_gamma"
-        progress = told.during(name, p)
+        progress = partial(told.during, name, p)
         trace = closed_loop(system, both[name], x0[:taken] if own else x0, steps, p, seed, law, domain, progress=progress)
         told.after(name, int(trace.violation.sum()))
         refused = starts - taken if own and starts_from != "both" else None

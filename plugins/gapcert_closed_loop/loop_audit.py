@@ -1,7 +1,9 @@
-"""Closed-loop runs held against what was promised: step by step, and all of them as an audit."""
+"""Closed-loop runs held against what was promised: step by step, all of them as an audit, and in sentences."""
 
 from __future__ import annotations
 
+from bisect import bisect_left
+from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 from typing import Any, final
@@ -65,8 +67,21 @@ def audited(failed: Bools, beta: float, steps: int, policies: tuple[str, ...]) -
 def largest(v: int, n: int, beta: float) -> float:
     """The probability that v of n draws show at confidence 1 − β not to be exceeded: the smallest ε of four digits, rounded up,
     with P(Bin(n, ε) ≤ v) ≤ β (Clopper and Pearson 1934)."""
-    low, high, goal = 0, 10_000, Decimal(beta)
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if missed(v, n, middle / 10_000) <= goal else (middle, high)
-    return high / 10_000
+    goal = Decimal(beta)
+    return (1 + bisect_left(range(1, 10_000), True, key=lambda k: missed(v, n, k / 10_000) <= goal)) / 10_000
+
+
+def loop_failures(summary: Mapping[str, Any], claim: str = "") -> list[str]:
+    """The policies under which runs with γ fail, or steps refute a claim about all of Z that the controller rests on."""
+    rows = [p for p in summary["policies"] if p["controller"] == "with_gamma"]
+    bad = [p for p in rows if p["violations"]]
+    out = [f"closed loop with γ: {p['violations']} of {p['starts']} runs fail under policy '{p['policy']}'" for p in bad]
+    return out + [broken_sentence(p) for p in rows if p.get("broken_promises") and claim in ("deterministic", "assumed")]
+
+
+def broken_sentence(row: Mapping[str, Any]) -> str:
+    """What the broken promises of a row refute."""
+    text = f"closed loop with γ: {row['broken_promises']} steps under policy '{row['policy']}' break the controller's promise"
+    parts = {"gap": "γ, the residual being outside [l, u]", "bound": "the bound of the model's successors"}
+    found = [f"{n} refute {parts[cause]}" for cause, n in row.get("refuted", {}).items() if n]
+    return f"{text}: {' and '.join(found)}" if found else text

@@ -1,24 +1,124 @@
-"""Does γ still hold? New measurements against a certificate, from a log or one transition at a time."""
+"""Does γ still hold? New measurements against a certificate: a log, or one transition at a time."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, final
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, final
 
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.plugin import Array, Interval, Model, Recording, UsageError
+from gapcert import Array, Interval, Model, Recording, Trajectory, UsageError
+from gapcert.plugin import Coordinates, RelativeModel, Zone, damage_told, difference, magnitude, stated_units, without_units
 from gapcert_monitor.thresholds import THRESHOLDS
-from gapcert_recordings import Transitions, axes
+from gapcert_recordings import Table, Transitions, axes, inspect
+from gapcert_verify import Evidence, bounds, load, zone
 
-from .certified import Certified as Certified
-from .logs import read_log as read_log
-from .logs import stated_noise as stated_noise
-from .monitor import Monitor as Monitor
-from .monitor import Observation as Observation
-from .monitor import rate_limit
+if TYPE_CHECKING:
+    from gapcert.plugin import Certificate, Declaration, Predictor
+
+Band = Callable[[Array], tuple[Array, Array]]
+
+
+@final
+@dataclass(frozen=True)
+class Certified:
+    """What a certificate is about: the model f, the set Z, and (l, u) at points of it.
+
+    `relative`: where Z and the band are in coordinates (x, w) and the model in (x, u), how w is made.
+    """
+
+    model: Model
+    zone: Zone
+    band: Band
+    relative: Coordinates | None = None
+
+    @classmethod
+    def of(cls, certificate: Certificate | Declaration) -> Certified:
+        """UsageError where the certificate has lost its model, as one that was unpickled without it."""
+        model = certificate.model
+        if model is None:
+            raise UsageError(
+                "check: the certificate holds no model; expected one from `certify` or a run; give the run's folder"
+            )
+        relative = model.relative if isinstance(model, RelativeModel) else None
+        f = model.inner if isinstance(model, RelativeModel) else model
+        assert isinstance(f, Model), "the nominal side of a certificate is a model"
+        return cls(f, certificate.domain.zone, certificate.gap.interval, relative)
+
+    @classmethod
+    def load(cls, folder: Path | str, allow_code: bool = False) -> Certified:
+        """From a run's folder: its spec makes the model, its stored certificate the band; the backend is not needed.
+
+        Only where the certificate counts hidden states of the backend among its states is the backend built.
+        """
+        with damage_told(folder):
+            return cls._loaded(Path(folder), allow_code)
+
+    @classmethod
+    def _loaded(cls, where: Path, allow_code: bool) -> Certified:
+        from gapcert.plugin import Build, ModelPredictor, load_spec, regular, widen
+
+        evidence, data = load(where), _stored(where, "spec.json")
+        home = Path(_stored(where, "run.json").get("folder", "."))
+        # What is not asked for need not be there: neither engines nor their files.
+        only = {k: data[k] for k in ("version", "name", "model")}
+        model: Model = load_spec(only, folder=home).build("model", allow_code=allow_code)
+        extended: Model | None = None
+        if evidence.data["predictor"] == "model":
+            named = home / data["gap"]["predictor"]["model"]
+            if not regular(named):
+                raise UsageError(f"{named}: there is no such file; expected the extended model that the certificate names")
+            extended = load_spec(named).build("model", allow_code=allow_code)
+        if evidence.data["domain"]["states"] != model.nx:
+            backend, domain = Build(load_spec(data, folder=home), None, where.parent, allow_code).against(model)
+            model, _ = widen(model, backend, domain)
+            extended = None if extended is None else widen(extended, backend, domain)[0]
+        relative = Coordinates.of(model, data["coordinates"]) if data.get("coordinates") else None
+        p = None
+        if extended is not None:
+            pair = (
+                (extended, model) if relative is None else (RelativeModel(extended, relative), RelativeModel(model, relative))
+            )
+            p = ModelPredictor(*pair)
+        return cls(model, zone(evidence.data), _stored_band(evidence, p), relative)
+
+    def points(self, x: Array, u: Array) -> Array:
+        """z (n, nz) in the coordinates of Z; angles on the turn that is nearest to the middle of Z."""
+        z = np.hstack([x, u])
+        for j, axis in enumerate(self.model.states):
+            if axis.kind == "angle":
+                middle = (self.zone.low[j] + self.zone.high[j]) / 2
+                turns = np.round((z[:, j] - middle) / (2 * np.pi))
+                # A whole turn is subtracted only where there is one: it is rounded.
+                z[:, j] = np.where(turns != 0, z[:, j] - 2 * np.pi * turns, z[:, j])
+        return z if self.relative is None else self.relative.over(Interval.exact(z)).mid
+
+    def residual(self, x: Array, u: Array, x_next: Array) -> Array:
+        """r = x⁺ − f(x, u), (n, nx)."""
+        return difference(self.model.states, x_next, self.model.step(x, u).x)
+
+
+def _stored(folder: Path, name: str) -> dict[str, Any]:
+    try:
+        found: dict[str, Any] = json.loads((folder / name).read_text(encoding="utf-8"))
+        if not isinstance(found, dict):
+            raise ValueError("it holds no object")
+    except (OSError, ValueError, RecursionError) as error:
+        raise UsageError(f"{folder / name}: cannot be read ({error}); expected the folder of a finished run") from None
+    return found
+
+
+def _stored_band(evidence: Evidence, p: Predictor | None) -> Band:
+    def band(z: Array) -> tuple[Array, Array]:
+        e = evidence if p is None else replace(evidence, arrays={**evidence.arrays, "predictor.check": p(z)})
+        low, high = bounds(e, z, "predictor.check")
+        return low.lo, high.hi
+
+    return band
 
 
 @final
@@ -93,6 +193,13 @@ def check(certified: Certified, recording: Recording, noise: Mapping[str, float]
         stated,
     )
     return replace(made, hint=_hint(made, _noisy(steps, unknown, inside, model)))
+
+
+def rate_limit(k: int, n: int, confidence: float = THRESHOLDS.confidence) -> float:
+    """One-sided upper limit of a probability of which k of n independent trials were hits (Clopper and Pearson 1934)."""
+    from scipy.stats import beta
+
+    return 1.0 if k >= n else float(beta.ppf(confidence, k + 1, n - k))
 
 
 def _allowance(model: Model, z: Array, noise: Array) -> Array:
@@ -202,3 +309,97 @@ def in_words(found: Check) -> list[str]:
     trends = {n: d for n, d in found.drift.items() if d is not None and d["trend"]}
     lines += [f"  {n} drifts by {d['change']:.3g} (± {d['error']:.2g}) along the log" for n, d in trends.items()]
     return [*lines, *([found.hint] if found.hint else [])]
+
+
+@final
+class Observation(NamedTuple):
+    """One transition: did it begin in Z, r (nx,), γ (nx,) (∞ outside Z), and is |r_i| > γ_i for some i?"""
+
+    inside: bool
+    residual: Array
+    gamma: Array
+    violated: bool
+
+
+@final
+class Monitor:
+    """γ watched online: `step` takes one measured transition of one period, and counts."""
+
+    def __init__(self, certified: Certified) -> None:
+        axes(certified.model)
+        self._certified = certified
+        self.points = self.outside = self.violations = 0
+
+    def step(self, x: Array, u: Array, x_next: Array) -> Observation:
+        """x (nx,), u (nu,), held for the period, and x_next (nx,)."""
+        at, given, after = (np.asarray(v, dtype=np.float64).reshape(1, -1) for v in (x, u, x_next))
+        c = self._certified
+        z = c.points(at, given)
+        r = c.residual(at, given, after)
+        if not c.zone.contains(z)[0]:
+            self.outside += 1
+            return Observation(False, r[0], np.full(r.shape[1], np.inf), False)
+        low, high = c.band(z)
+        gamma = np.maximum(np.abs(low), np.abs(high))
+        # A value that is not a number does not confirm γ.
+        violated = not bool((np.abs(r) <= gamma).all())
+        self.points += 1
+        self.violations += violated
+        return Observation(True, r[0], gamma[0], violated)
+
+    @property
+    def rate(self) -> float | None:
+        """Violations per transition that began in Z."""
+        return self.violations / self.points if self.points else None
+
+    @property
+    def rate_limit(self) -> float | None:
+        """Upper limit of the rate at 95 %, if transitions were independent."""
+        return rate_limit(self.violations, self.points) if self.points else None
+
+
+def read_log(path: Path | str, certified: Certified) -> Recording:
+    """A log by its columns, which bear the names of states and inputs; or the recording of a spec, which maps them."""
+    from gapcert.plugin import load_spec
+
+    where = Path(path)
+    if where.suffix in (".yaml", ".yml"):
+        spec = load_spec(where)
+        if spec.config.recording is None:
+            raise UsageError(f"{path}: the spec has no recording; expected a log, or the spec of a diagnosis")
+        return spec.recorded()
+    tables, names = inspect(where), axes(certified.model)
+    named = [(t, without_units(c.name for c in t.columns)) for t in tables]
+    whole = [(t, [(n, of[n]) for n in names]) for t, of in named if t.time is not None and set(names) <= of.keys()]
+    if not whole:
+        columns = [*dict.fromkeys(c.name for t in tables for c in t.columns)]
+        lacking = next((n for n in names if not any(n in of for _, of in named)), None)
+        what = f"no column '{lacking}'" if lacking else "no table with the times (time or t) and all of " + ", ".join(names)
+        raise UsageError(
+            f"{path}: {what} (there are {', '.join(columns)}); expected the times and columns {', '.join(names)}, in the "
+            f"model's units or with their own, '{names[0]} [{certified.model.states[0].unit}]'; the spec of a diagnosis, whose "
+            f"`recording:` maps other names, serves as well"
+        )
+    return Recording(tuple(_trajectory(t, dict(of), certified.model) for t, of in whole))
+
+
+def _trajectory(table: Table, columns: Mapping[str, str], model: Model) -> Trajectory:
+    """Of the columns that channels have, in the model's units."""
+    values = {c.name: c.values for c in table.columns}
+    own = Trajectory(table.t, {n: values[c] for n, c in columns.items()}, table.name)
+    units = {n: unit for n, c in columns.items() for unit in stated_units([c]).values()}
+    to = {s.name: s.unit for s in (*model.states, *model.inputs) if s.name in units}
+    return Recording((own,), units).converted(to).trajectories[0]
+
+
+def stated_noise(texts: Sequence[str], certified: Certified) -> dict[str, float]:
+    """From texts such as `theta=0.1 deg`, in the model's units."""
+    units = {s.name: s.unit for s in (*certified.model.states, *certified.model.inputs)}
+    out = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        try:
+            out[name] = magnitude(value, units.get(name, "1"))
+        except ValueError as error:
+            raise UsageError(f"--noise {text}: {error}; write CHANNEL=VALUE") from None
+    return out

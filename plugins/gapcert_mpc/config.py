@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, final
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import ConfigDict, Field
+
+from gapcert.plugin import Section
 
 Quantity = float | str
+Choice = Literal["auto", "osqp", "piqp", "clarabel"]
 Weight = Annotated[float, Field(ge=0)]
 
 
 @final
-class Terminal(BaseModel):
+class Terminal(Section):
     """Plans end in the winning set of this synthesizer, whose controller is on cells; its options stand beside these."""
 
     model_config = ConfigDict(frozen=True, extra="allow")
@@ -21,19 +24,15 @@ class Terminal(BaseModel):
 
 
 @final
-class Schedule(BaseModel):
+class Schedule(Section):
     """A reference that jumps: each value is wanted from its time after the start of a run on."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     at: list[tuple[Quantity, Quantity]] = Field(description="pairs [time, value], the first of them at 0 s")
 
 
 @final
-class Soft(BaseModel):
+class Soft(Section):
     """A range that is preferred; being outside by e half-ranges costs linear·e + quadratic·e² in each period."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     range: tuple[Quantity, Quantity] = Field(description="[low, high]")
     linear: float = Field(10.0, gt=0, description="a large one keeps the range wherever a plan can")
@@ -41,13 +40,11 @@ class Soft(BaseModel):
 
 
 @final
-class MpcConfig(BaseModel):
+class MpcConfig(Section):
     """Horizon in periods, what the plan is drawn to, and what it costs to be away from there.
 
     Weights are those of squared distances, each measured in half of its range: 1 and 1 weigh a state and an input alike.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: Literal["mpc"] = "mpc"
     horizon: int = Field(20, ge=1, le=1000, description="periods that are planned ahead")
@@ -56,7 +53,7 @@ class MpcConfig(BaseModel):
         description="states and inputs that are wanted, or {at: [[time, value], …]}; default: the middle of the goal, and rest",
     )
     weights: dict[str, Weight] = Field(default_factory=dict, description="costs per state and input; default: 1")
-    solver: Literal["auto", "osqp", "piqp", "clarabel"] = Field(
+    solver: Choice = Field(
         "auto", description="who solves the quadratic program first; auto: who needs less work on sample runs"
     )
     tolerance: float = Field(

@@ -13,17 +13,15 @@ from typing import Any, Generic, Protocol, TypeVar, final
 
 import numpy as np
 
-from gapcert import Array, Controller, Event, Goal, UsageError
-from gapcert.plugin import Bools, Ints, Policy, Pulse
+from gapcert.plugin import Array, Bools, Controller, Event, Goal, Ints, Policy, Pulse, UsageError
 from gapcert_cells import loading, write_saved
 
 from .planning.arrival import Arrival
 from .planning.design import Design
-from .planning.engine import Engine, Planner, Tracker
+from .planning.engine import Engine, Landing, Planner, Tracker
 from .planning.plans import Held, Memory, Plan
+from .planning.requirements import wanted
 from .planning.successive import Successive
-from .planning.terminal_boxes import Landing
-from .planning.tracking import another
 from .program.linearise import Nominal
 from .program.solver import Name
 from .saved_models import known, pair
@@ -221,7 +219,14 @@ class MpcController(PlanController[Held]):
         """
         if self.design is None or self.design.successive or self.design.scene or self.design.ends:
             raise UsageError("aim: only invariance, along one straight line, takes another reference; make another controller")
-        z = another(self.engine.program, self.design.frame, reference, self.goal.stay.axes)
+        axes = self.goal.stay.axes
+        if unknown := [name for name in reference if name not in self.goal.stay.names]:
+            raise UsageError(f"aim: '{unknown[0]}' is no state; expected some of {', '.join(self.goal.stay.names)}")
+        try:
+            z = self.engine.program.target(*wanted(reference, axes, self.design.frame))
+        except ValueError as error:
+            raise UsageError(f"aim: {error}") from None
+        assert z is not None, "a controller that wins has a steady pair"
         held = self.memory.of(memory)
         return np.array([0 if h is None else self.memory.add(h._replace(aim=z)) for h in held], dtype=np.int64)
 

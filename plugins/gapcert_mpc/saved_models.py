@@ -8,8 +8,7 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert import Array, Domain, GapFunction, Model, registry
-from gapcert.plugin import identity, located
+from gapcert.plugin import Array, Domain, GapFunction, Model, identity, located, registry
 from gapcert_mpc.variants.parameters import built
 
 PLAIN = (bool, int, float, str, type(None))

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from copy import copy
 from pathlib import Path
-from typing import final
+from typing import Any, final
 
-from gapcert import Controller, Domain, Goal, Model, SynthesisProblem, UsageError
+from gapcert.plugin import Controller, Domain, Goal, Model, SynthesisProblem, Synthesizer, UsageError
 from gapcert_cells import loading
 
+from .config import MpcConfig
 from .controller import MpcController
-from .planning import tracking
-from .program.constraints import limits, preferred
-from .task import MpcOptions, Task, frame_of
+from .planning.requirements import check_reference, limits, moments, preferred
+from .task import STARTS, Task
 from .variants.adaptive import AdaptiveMpcController, adaptive
 from .variants.parameters import named, ranged
 from .variants.reaching import reaching
@@ -22,63 +20,82 @@ from .variants.terminal import Ending, HandedController, handed
 
 
 @final
-class Mpc(MpcOptions):
+class Mpc(Synthesizer):
     """Tube MPC for x⁺ ∈ f(x, u) + [l, u](x, u); see `gapcert_mpc.config` for the options.
 
     f + p is made straight over the whole goal, or at each step about the plan; the error of that is added to the tube.
     """
 
+    name = "mpc"
+
+    def __init__(self, **options: Any) -> None:
+        self.options = MpcConfig(**{name: option for name, option in options.items() if option is not None})
+        self.starts = STARTS[self.options.linearisation]
+
+    @property
+    def _of_boxes(self) -> dict[str, Any]:
+        """Options of the controllers for boxes of parameters, JSON-able."""
+        return dict(sorted(self.options.model_dump(exclude={"kind", "adapt", "levels", "terminal"}).items()))
+
     def check(self, model: Model, domain: Domain, goal: Goal) -> None:
         goal.check(domain)
+        asked = self.options
         if goal.kind != "reach_avoid" and (goal.kind != "invariance" or goal.avoid is not None):
-            asked = goal.kind if goal.avoid is None else f"{goal.kind} with obstacles"
-            raise UsageError(f"controller: mpc knows the goals invariance, reach and reach_avoid; found {asked}")
-        if goal.kind == "reach_avoid" and (self.adapt or self.linearisation != "once"):
+            found = goal.kind if goal.avoid is None else f"{goal.kind} with obstacles"
+            raise UsageError(f"controller: mpc knows the goals invariance, reach and reach_avoid; found {found}")
+        if goal.kind == "reach_avoid" and (asked.adapt or asked.linearisation != "once"):
             raise UsageError("controller: mpc reaches a target along one straight line only; leave adapt and linearisation out")
-        if self.terminal is not None:
-            if goal.kind != "invariance" or self.adapt or self.linearisation != "once":
+        if asked.terminal is not None:
+            if goal.kind != "invariance" or asked.adapt or asked.linearisation != "once":
                 raise UsageError(
                     "controller.terminal: plans end in a winning set for invariance, along one straight line; leave adapt and "
                     "linearisation out, or terminal"
                 )
-            Ending(self.terminal).check(model, domain, goal)
-        plain = goal.kind == "invariance" and not self.adapt and self.linearisation == "once" and self.terminal is None
-        if self.feedback == "disturbance" and not plain:
+            Ending(asked.terminal).check(model, domain, goal)
+        plain = goal.kind == "invariance" and not asked.adapt and asked.linearisation == "once" and asked.terminal is None
+        if asked.feedback == "disturbance" and not plain:
             raise UsageError(
                 "controller.feedback: disturbance keeps invariance along one straight line only; leave adapt, terminal and "
                 "linearisation out, or use `feedback: fixed`"
             )
         names = domain.states.names + domain.inputs.names
-        for field, given in (("reference", [*self.reference]), ("weights", [*self.weights])):
+        for field, given in (("reference", [*asked.reference]), ("weights", [*asked.weights])):
             if unknown := [n for n in given if n not in names]:
                 raise UsageError(f"controller.{field}: '{unknown[0]}' is unknown; expected some of {', '.join(names)}")
-        tracking.check(self.reference, domain.axes, model.period)
-        limits(self.rates, domain)
-        preferred(self.soft, domain, frame_of(goal, domain), 1.0)
-        moves = len(tracking.moments(self.reference, model.period)) > 1
+        check_reference(asked.reference, domain.axes, model.period)
+        limits(asked.rates, domain)
+        preferred(asked.soft, domain, Task(SynthesisProblem(model, None, domain, goal), asked, 0).frame, 1.0)
+        moves = len(moments(asked.reference, model.period)) > 1
         for field, used, what in (
             ("reference", moves, "what is wanted moves"),
-            ("rates", bool(self.rates), "inputs are limited in how fast they change"),
-            ("soft", bool(self.soft), "ranges are preferred"),
+            ("rates", bool(asked.rates), "inputs are limited in how fast they change"),
+            ("soft", bool(asked.soft), "ranges are preferred"),
         ):
-            if used and not (plain and self.feedback == "fixed"):
+            if used and not (plain and asked.feedback == "fixed"):
                 raise UsageError(
                     f"controller.{field}: {what} for invariance only, along one straight line and under one gain; leave adapt, "
                     f"terminal, linearisation and feedback out, or {field}"
                 )
-        for p in named(model, self.adapt) if self.adapt else ():
-            ranged(p, self.adapt[p.name])
+        for p in named(model, asked.adapt) if asked.adapt else ():
+            ranged(p, asked.adapt[p.name])
 
     def synthesize(self, problem: SynthesisProblem) -> Controller:
         self.check(problem.model, problem.domain, problem.goal)
-        make = next(make for suits, make in VARIANTS if suits(self, problem.goal))
-        return make(Task(problem, self))
+        task, asked = Task(problem, self.options, self.starts), self.options
+        if asked.feedback == "disturbance":
+            # Its programs are compiled: nobody else waits for that.
+            from .variants.disturbance import answering
+
+            return answering(task)
+        if asked.terminal is not None:
+            return handed(task)
+        if asked.adapt:
+            return adaptive(task, self._of_boxes, Mpc(**self._of_boxes).for_box)
+        return reaching(task) if problem.goal.kind == "reach_avoid" else regulating(task)
 
     def for_box(self, problem: SynthesisProblem, like: MpcController | None) -> MpcController:
         """For one box of the parameters; those after the first have its gain and its solver, and are made as a run goes on."""
-        options = copy(self)
-        options.starts = self.starts if like is None else 1
-        return regulating(Task(problem, options), like)
+        return regulating(Task(problem, self.options, self.starts if like is None else 1), like)
 
     @staticmethod
     def load(folder: Path | str) -> Controller:
@@ -90,24 +107,7 @@ class Mpc(MpcOptions):
         if "adapt" in data:
             return AdaptiveMpcController.load(folder, lambda options: Mpc(**options).for_box)
         if "feedback" in data:
-            # Its programs are compiled: nobody else waits for that.
             from .variants.disturbance import DisturbanceMpcController
 
             return DisturbanceMpcController.load(folder)
         return MpcController.load(folder)
-
-
-def _answering(task: Task) -> Controller:
-    from .variants.disturbance import answering
-
-    return answering(task)
-
-
-VARIANTS: tuple[tuple[Callable[[MpcOptions, Goal], bool], Callable[[Task], Controller]], ...] = (
-    (lambda options, goal: options.feedback == "disturbance", _answering),
-    (lambda options, goal: options.terminal is not None, handed),
-    (lambda options, goal: bool(options.adapt), lambda task: adaptive(task, Mpc(**task.options.of_boxes).for_box)),
-    (lambda options, goal: goal.kind == "reach_avoid", reaching),
-    (lambda options, goal: True, regulating),
-)
-"""Who makes controllers, and when: the first that suits."""

@@ -3,80 +3,35 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from inspect import signature
-from typing import Any, Literal, final
+from typing import final
 
 import numpy as np
 
-from gapcert import Array, Domain, Goal, SynthesisProblem
-from gapcert.plugin import Pulse, Synthesizer
+from gapcert.plugin import Array, Domain, Pulse, SynthesisProblem
 from gapcert_mpc.thresholds import THRESHOLDS
 
-from .config import Soft, Terminal
+from .config import MpcConfig
 from .controller import MpcController
-from .planning import tracking
+from .planning import requirements
 from .program.linearise import Frame, Nominal, Stages
 from .program.program import Rows, Weights
-from .program.solver import Choice
 from .program.tube import riccati, unreached
 
-Linearisation = Literal["once", "successive"]
-STARTS: dict[Linearisation, int] = {"once": 400, "successive": 64}
-
-
-class MpcOptions(Synthesizer):
-    """As `MpcConfig` has them; `starts` is how many states are asked for what the controller wins."""
-
-    name = "mpc"
-
-    def __init__(
-        self,
-        horizon: int = 20,
-        reference: Mapping[str, Any] | None = None,
-        weights: Mapping[str, float] | None = None,
-        solver: Choice = "auto",
-        tolerance: float = 1e-5,
-        majorant: Literal["auto", "affine", "constant"] = "auto",
-        linearisation: Linearisation = "once",
-        adapt: Mapping[str, Any] | None = None,
-        levels: int = 4,
-        searches: int = 30,
-        rates: Mapping[str, float | str] | None = None,
-        soft: Mapping[str, Any] | None = None,
-        terminal: Any = None,
-        feedback: Literal["fixed", "disturbance"] = "fixed",
-    ) -> None:
-        self.rates, self.soft = dict(rates or {}), {n: Soft.model_validate(v) for n, v in (soft or {}).items()}
-        self.horizon, self.reference, self.weights = horizon, tracking.stated(reference or {}), dict(weights or {})
-        self.solver: Choice = solver
-        self.tolerance, self.majorant, self.linearisation = tolerance, majorant, linearisation
-        self.searches, self.terminal = searches, None if terminal is None else Terminal.model_validate(terminal)
-        self.feedback = feedback
-        self.adapt, self.levels, self.starts = dict(adapt or {}), levels, STARTS[linearisation]
-
-    @property
-    def of_boxes(self) -> dict[str, Any]:
-        """Those of the controllers for boxes of parameters, JSON-able."""
-        names = signature(MpcOptions).parameters.keys() - {"adapt", "levels", "terminal"}
-        return {name: getattr(self, name) for name in sorted(names)}
-
-
-def frame_of(goal: Goal, domain: Domain) -> Frame:
-    """Of the states of a goal, and inputs."""
-    box = Domain(goal.stay, domain.inputs)
-    return Frame.of(box.low, box.high, domain.nx)
+STARTS = {"once": 400, "successive": 64}
+"""By linearisation: how many states are asked for what a controller wins."""
 
 
 @final
 @dataclass(frozen=True)
 class Task:
-    """A problem, with the options by which its controller is made."""
+    """A problem, with the options by which its controller is made; `starts` states are asked for what it wins."""
 
     problem: SynthesisProblem
-    options: MpcOptions
+    options: MpcConfig
+    starts: int
 
     @property
     def box(self) -> Domain:
@@ -90,7 +45,7 @@ class Task:
 
     @cached_property
     def frame(self) -> Frame:
-        return frame_of(self.problem.goal, self.problem.domain)
+        return Frame.of(self.box.low, self.box.high, self.problem.domain.nx)
 
     @cached_property
     def nominal(self) -> Nominal:
@@ -128,8 +83,8 @@ class Task:
 
     def wanted(self, step: int = 0) -> tuple[Array, Array]:
         """The reference at a step of a run in the frame, and how much each of it matters."""
-        now = tracking.at(self.options.reference, step, self.problem.model.period)
-        return tracking.wanted(now, self.problem.domain.axes, self.frame)
+        now = requirements.at(self.options.reference, step, self.problem.model.period)
+        return requirements.wanted(now, self.problem.domain.axes, self.frame)
 
     def weights(self, stages: Stages) -> Weights:
         cost = np.array([float(self.options.weights.get(axis.name, 1.0)) for axis in self.problem.domain.axes])

@@ -15,7 +15,7 @@ from gapcert.certification.routes import Request
 from gapcert.numerics.intervals import Interval
 from gapcert.numerics.order_statistics import points_needed
 from gapcert.testing.toys import Drift
-from gapcert_calibrate.noise_draws import NoiseDraws
+from gapcert_calibrate.stochastic_backend import NoiseDraws
 from gapcert_verify.verify import verify_run
 
 Array = np.ndarray

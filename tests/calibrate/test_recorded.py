@@ -12,7 +12,7 @@ from measuring import PERIOD, RANGES, calibrated, recording
 import gapcert as gc
 from gapcert.numerics.order_statistics import DRAWN_WINDOWS
 from gapcert.testing.toys import Drift
-from gapcert_calibrate.windows import Windows
+from gapcert_calibrate.recording_certificate import Windows
 from gapcert_figures.data import SHOWN, recorded_figure
 from gapcert_report.pictures.gap import recorded_pictures
 from gapcert_verify.verify import verify_run

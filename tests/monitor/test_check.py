@@ -10,8 +10,7 @@ import pytest
 import gapcert as gc
 from gapcert.cli.main import main
 from gapcert.testing.toys import Drift, Perturbed, ripple, ripple_lipschitz
-from gapcert_monitor.check import check
-from gapcert_monitor.monitor import rate_limit
+from gapcert_monitor.check import check, rate_limit
 from gapcert_recordings.transitions import Transitions
 
 RANGES = {"x0": (-1.0, 1.0), "u0": (-2.0, 2.0)}

@@ -12,14 +12,13 @@ import pytest
 from gapcert import Domain, Goal, Interval, SynthesisProblem, UsageError, closed_loop, load_controller, load_spec
 from gapcert_cells.testing import Band, Rod, rod_problem
 from gapcert_closed_loop.closed_loop import compare_loops
-from gapcert_closed_loop.parameter_sets import summary
+from gapcert_closed_loop.prediction import summary
 from gapcert_figures.data import loop_figure
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.synthesizer import Mpc
 from gapcert_mpc.task import STARTS
 from gapcert_mpc.variants.adaptive import Levels
-from gapcert_mpc.variants.membership import Membership
-from gapcert_mpc.variants.parameters import Family, built
+from gapcert_mpc.variants.parameters import Family, Membership, built
 from gapcert_report.pictures.loop import learned_pictures
 from gapcert_report.words.words import learned_sentence
 

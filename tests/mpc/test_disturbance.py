@@ -22,7 +22,7 @@ HORIZON = 8
 
 
 def synthesizer(horizon: int = HORIZON, **options: object) -> Mpc:
-    made = Mpc(**{"horizon": horizon, "feedback": "disturbance", **options})  # type: ignore[arg-type]
+    made = Mpc(**{"horizon": horizon, "feedback": "disturbance", **options})
     made.starts = 10
     return made
 

@@ -372,7 +372,7 @@ def test_what_cannot_be_reached_has_a_reason() -> None:
 PRINTS = """
 import json
 import numpy as np, scipy.optimize
-from gapcert_mpc.planning.search import optimum
+from gapcert_mpc.planning.arrival import optimum
 rng = np.random.default_rng(6)
 for _ in range(40):
     n, m = int(rng.integers(4, 10)), int(rng.integers(2, 6))

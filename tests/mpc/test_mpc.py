@@ -12,10 +12,10 @@ from gapcert import GapFunction, Interval, UsageError
 from gapcert.testing import SynthesizerContract
 from gapcert_cells.testing import Band, rod_problem
 from gapcert_mpc.controller import MpcController
-from gapcert_mpc.invariant import margin
 from gapcert_mpc.program.linearise import Frame, Nominal
 from gapcert_mpc.program.tube import Section, regulator
 from gapcert_mpc.synthesizer import Mpc
+from gapcert_mpc.variants.regulation import margin
 
 Array = np.ndarray
 GAP = Band((-1.5e-4, -6e-5), (1.5e-4, 6e-5))

@@ -15,7 +15,6 @@ from gapcert_cells.testing import Band
 from gapcert_equations.config import EquationsConfig
 from gapcert_mpc import controller, task
 from gapcert_mpc.controller import MpcController
-from gapcert_mpc.invariant import margin
 from gapcert_mpc.planning import successive
 from gapcert_mpc.planning.plans import Held
 from gapcert_mpc.planning.successive import Successive
@@ -23,6 +22,7 @@ from gapcert_mpc.program.linearise import Frame, Nominal, Stages
 from gapcert_mpc.program.program import Program
 from gapcert_mpc.program.solver import SOLVERS
 from gapcert_mpc.synthesizer import Mpc
+from gapcert_mpc.variants.regulation import margin
 
 Array = np.ndarray
 CARTPOLE = {
@@ -277,9 +277,9 @@ def test_updates_equal_a_fresh_program(cartpole: MpcController) -> None:
     assert (program.high == fresh.high).all()
     for solver in (SOLVERS["piqp"], SOLVERS["clarabel"]):
         first = design.program()
-        used = solver(first.P, first.q, first.A, first.low, first.high, 1e-6)
-        used.update(A=program.A.data, low=program.low, high=program.high)
-        a, b = used.solve(), solver(first.P, first.q, program.A, program.low, program.high, 1e-6).solve()
+        used, now = solver(first.qp, 1e-6), program.qp._replace(P=first.P, q=first.q)
+        used.update(now, varied=True)
+        a, b = used.solve(), solver(now, 1e-6).solve()
         assert a.status == b.status == "solved"
         np.testing.assert_allclose(a.z[program.at["u"]], b.z[program.at["u"]], atol=1e-3)
 
@@ -316,7 +316,7 @@ def test_saved_and_loaded_with_its_model(cartpole: MpcController, tmp_path: Path
 
 def test_the_option_is_one_of_a_spec() -> None:
     config = registry().config("synthesizer", "mpc")
-    assert registry().build("synthesizer", "mpc", config(linearisation="successive")).linearisation == "successive"
+    assert registry().build("synthesizer", "mpc", config(linearisation="successive")).options.linearisation == "successive"
 
 
 @pytest.mark.exam

@@ -27,7 +27,9 @@ Majorant = Literal["auto", "affine", "constant"]
 @cache
 def _made(majorant: Majorant, rate: float | str | None, horizon: int) -> MpcController:
     rates = None if rate is None else {"torque": rate}
-    found = Mpc(horizon, {"theta": 0.19}, solver="osqp", majorant=majorant, rates=rates).synthesize(rod_problem(gap=GAP))
+    found = Mpc(horizon=horizon, reference={"theta": 0.19}, solver="osqp", majorant=majorant, rates=rates).synthesize(
+        rod_problem(gap=GAP)
+    )
     assert isinstance(found, MpcController)
     return found
 

@@ -14,7 +14,7 @@ from tube_designs import drawn
 from gapcert import UsageError
 from gapcert_cells.testing import Band, Rod, rod_problem, rod_reach_avoid
 from gapcert_mpc.controller import MpcController
-from gapcert_mpc.program.constraints import Preferred
+from gapcert_mpc.program.program import Preferred
 from gapcert_mpc.program.solver import Piqp
 from gapcert_mpc.synthesizer import Mpc
 
@@ -30,7 +30,9 @@ WEIGHTS = {"omega": 0.01, "torque": 0.001}
 def _made(majorant: str = "constant", linear: float | None = 300.0) -> MpcController:
     soft = None if linear is None else {"omega": {**SOFT["omega"], "linear": linear, "quadratic": 0.0}}
     problem = rod_problem(gap=GAP)
-    found = Mpc(12, {"theta": 0.17}, WEIGHTS, solver="piqp", majorant=majorant, soft=soft).synthesize(problem)  # type: ignore[arg-type]
+    found = Mpc(horizon=12, reference={"theta": 0.17}, weights=WEIGHTS, solver="piqp", majorant=majorant, soft=soft).synthesize(
+        problem
+    )
     assert isinstance(found, MpcController)
     return found
 
@@ -59,7 +61,7 @@ def slack(controller: MpcController, x: Array) -> Array:
     """e (N + 1,) of the best plan from x (frame), in half-ranges."""
     program = controller.engine.program
     program.begin(x)
-    found = Piqp(program.P, program.q, program.A, program.low, program.high, 1e-9).solve()
+    found = Piqp(program.qp, 1e-9).solve()
     assert found.status == "solved"
     return np.asarray(found.z[program.at["e"]])
 
@@ -71,7 +73,7 @@ def without_excess(controller: MpcController, x: Array) -> bool:
     high = program.high.copy()
     first = program._assembled().blocks["soft-positive"][0]
     high[first] = 1e-7
-    return Piqp(program.P, program.q, program.A, program.low, high, 1e-9).solve().status == "solved"
+    return Piqp(program.qp._replace(high=high), 1e-9).solve().status == "solved"
 
 
 @pytest.mark.exam

@@ -16,9 +16,8 @@ from gapcert import UsageError, closed_loop
 from gapcert_cells.testing import Band, Rod, rod_problem
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.planning.engine import Engine
-from gapcert_mpc.program.pieces import Pieces
-from gapcert_mpc.program.solver import SOLVERS, Osqp, QpSolver, solver
-from gapcert_mpc.program.tuning import tuned
+from gapcert_mpc.program.solver import SOLVERS, Osqp, Qp, QpSolver, solver
+from gapcert_mpc.program.tuning import Pieces, tuned
 from gapcert_mpc.synthesizer import Mpc
 
 Array = np.ndarray
@@ -39,8 +38,12 @@ class Random:
         self.low[:4] = self.high[:4] = value[:4]
         self.low[4:8], self.high[8:12] = -np.inf, np.inf
 
+    @property
+    def qp(self) -> Qp:
+        return Qp(self.P, self.q, self.A, self.low, self.high)
+
     def made(self, name: Any, tolerance: float = 1e-7) -> QpSolver:
-        found = solver(name, self.P, self.q, self.A, self.low, self.high, tolerance)
+        found = solver(name, self.qp, tolerance)
         if isinstance(found, Osqp):
             found.osqp.update_settings(max_iter=20_000)
         return found
@@ -87,7 +90,7 @@ def test_updates_in_place_are_a_fresh_set_up(name: str) -> None:
     moved = program.A @ program.inside - (program.low + program.high) / 2
     moved[~np.isfinite(moved)] = 0.1
     program.low, program.high = program.low + moved, program.high + moved
-    kept.update(q=program.q, low=program.low, high=program.high, A=program.A.data)
+    kept.update(program.qp, varied=True)
     fresh, z = program.made(name).solve(), program.best()[0]
     answer = kept.solve(np.zeros(len(z)), np.zeros(len(program.low)))
     assert answer.status == fresh.status == "solved"
@@ -119,9 +122,9 @@ def test_an_answer_is_a_function_of_data_and_guess(name: str) -> None:
     for seed in (4, 5):
         other = Random(seed)
         room = np.where(program.low == program.high, 0.0, 0.1)
-        two.update(q=other.q, low=program.low - room, high=program.high + room)
+        two.update(program.qp._replace(q=other.q, low=program.low - room, high=program.high + room))
         two.solve(other.q, np.ones(len(program.low)))
-    two.update(q=program.q, low=program.low, high=program.high)
+    two.update(program.qp)
     again = two.solve(*guess)
     assert np.array_equal(alone.z, again.z)
     assert np.array_equal(alone.y, again.y)

@@ -17,12 +17,11 @@ from gapcert.testing import SynthesizerContract
 from gapcert_cells.testing import Band, rod_problem, rod_reach_avoid
 from gapcert_mpc.config import MpcConfig, Terminal
 from gapcert_mpc.controller import MpcController
-from gapcert_mpc.inscribed import Sums, inscribed
 from gapcert_mpc.planning.design import Ends
-from gapcert_mpc.planning.terminal_boxes import Landing
+from gapcert_mpc.planning.engine import Landing
 from gapcert_mpc.synthesizer import Mpc
 from gapcert_mpc.variants import terminal
-from gapcert_mpc.variants.terminal import HandedController, lost
+from gapcert_mpc.variants.terminal import HandedController, Sums, inscribed, lost
 
 Array = np.ndarray
 GAP = Band((-1.5e-4, -6e-5), (1.5e-4, 6e-5))
@@ -132,8 +131,8 @@ def test_a_tube_that_follows_the_plan_ends_in_winning_cells_too() -> None:
 def test_a_spec_asks_for_it() -> None:
     config = MpcConfig.model_validate({"kind": "mpc", "terminal": CELLS | {"boxes": 3}})
     asked = registry().build("synthesizer", "mpc", config)
-    assert asked.terminal == Terminal(boxes=3, **CELLS)
-    assert registry().build("synthesizer", "mpc", MpcConfig()).terminal is None
+    assert asked.options.terminal == Terminal(boxes=3, **CELLS)
+    assert registry().build("synthesizer", "mpc", MpcConfig()).options.terminal is None
 
 
 def test_a_new_plan_takes_over_from_the_cells() -> None:

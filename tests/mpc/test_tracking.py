@@ -17,8 +17,8 @@ from gapcert_cells.testing import Band, Rod, rod_problem, rod_reach_avoid
 from gapcert_closed_loop.closed_loop import compare_loops
 from gapcert_figures.data import Figures, loop_figure
 from gapcert_mpc.controller import MpcController
-from gapcert_mpc.planning.tracking import Course
-from gapcert_mpc.program.solver import Piqp
+from gapcert_mpc.planning.design import Course
+from gapcert_mpc.program.solver import Piqp, Qp
 from gapcert_mpc.synthesizer import Mpc
 from gapcert_report.pictures.loop import wanted_pictures
 
@@ -34,7 +34,9 @@ SCHEDULE = {"theta": {"at": [[k * PERIOD, at] for k, at in zip(JUMPS, WANTED, st
 
 @cache
 def _made() -> MpcController:
-    found = Mpc(HORIZON, SCHEDULE, {"omega": 0.01, "torque": 0.001}, majorant="constant").synthesize(rod_problem(gap=GAP))
+    found = Mpc(horizon=HORIZON, reference=SCHEDULE, weights={"omega": 0.01, "torque": 0.001}, majorant="constant").synthesize(
+        rod_problem(gap=GAP)
+    )
     assert isinstance(found, MpcController)
     return found
 
@@ -103,7 +105,7 @@ def test_a_plan_that_had_to_end_at_the_reference_would_be_lost(controller: MpcCo
     fixed = sp.csc_matrix((np.ones(program.n), (np.arange(program.n), pair)), shape=(program.n, program.size))
     at = held.aim[: program.n]
     A, low, high = sp.vstack([program.A, fixed], format="csc"), np.append(program.low, at), np.append(program.high, at)
-    assert Piqp(program.P, program.q, A, low, high, 1e-8).solve().status == "infeasible"
+    assert Piqp(Qp(program.P, program.q, A, low, high), 1e-8).solve().status == "infeasible"
 
 
 def test_a_run_takes_another_reference_and_others_do_not(controller: MpcController) -> None:
@@ -164,7 +166,7 @@ def test_saved_sent_and_shared_out_it_goes_the_same_way(controller: MpcControlle
 
 @pytest.mark.exam
 def test_the_report_shows_what_is_wanted(controller: MpcController, tmp_path: Path) -> None:
-    still = Mpc(5, majorant="constant", solver="piqp").synthesize(rod_problem(gap=GAP))
+    still = Mpc(horizon=5, majorant="constant", solver="piqp").synthesize(rod_problem(gap=GAP))
     loops = [compare_loops(Rod(), c, c, starts=2, steps=140, policies=()) for c in (controller, still)]
     figure, none = (loop_figure(loop, Rod(), c, c) for loop, c in zip(loops, (controller, still), strict=True))
     assert np.allclose(figure.wanted[[0, JUMPS[1] - 1, JUMPS[1]], 0], [WANTED[0], WANTED[0], WANTED[1]], atol=1e-3)

@@ -12,10 +12,9 @@ from tube_designs import drawn, mecanum, with_pieces
 
 from gapcert_mpc.planning.design import Design
 from gapcert_mpc.planning.engine import Engine
-from gapcert_mpc.program.constraints import Preferred
-from gapcert_mpc.program.minimal_tube import Least
-from gapcert_mpc.program.program import Program
+from gapcert_mpc.program.program import Preferred, Program
 from gapcert_mpc.program.solver import SOLVERS, solver
+from gapcert_mpc.program.tuning import Least
 
 Array = np.ndarray
 
@@ -52,14 +51,13 @@ def test_every_solver_gives_what_the_formulas_give(seed: int, variable: bool, so
 
     design = softened(drawn(seed, variable)) if soft else drawn(seed, variable)
     program, reference = design.program(), twin(design)
-    data = (program.P, program.q, program.A, program.low, program.high, 1e-7)
-    solvers = [solver(name, *data) for name in SOLVERS]
+    solvers = [solver(name, program.qp, 1e-7) for name in SOLVERS]
     found, excess = 0, 0.0
     for x in starts(design, seed, 4):
         u, best = reference.solve(x)
         program.begin(x)
         for s in solvers:
-            s.update(low=program.low, high=program.high)
+            s.update(program.qp)
             answer = s.solve()
             if answer.status == "unfinished":
                 continue
@@ -95,11 +93,11 @@ def test_the_least_tube_keeps_what_any_tube_keeps(made: Callable[..., Design], g
     """Answers of an interior-point method leave room; the tube that is computed keeps all rows, and is no wider."""
     design = made(*given)
     program = design.program()
-    least, solve = Least(program), solver("piqp", program.P, program.q, program.A, program.low, program.high, 1e-8)
+    least, solve = Least(program), solver("piqp", program.qp, 1e-8)
     _, more, _ = program.terminal
     for x in starts(design, 3, 6):
         program.begin(x)
-        solve.update(low=program.low, high=program.high)
+        solve.update(program.qp)
         answer = solve.solve()
         if answer.status != "solved":
             continue

@@ -330,7 +330,7 @@ def test_what_a_controller_foresaw_is_in_the_recording(tmp_path):
 
 
 def test_what_is_learned_is_in_the_recording(tmp_path):
-    from gapcert_closed_loop.parameter_sets import Learned
+    from gapcert_closed_loop.prediction import Learned
     from gapcert_figures.data import Axis, LoopFigure, Runs
     from gapcert_rerun.stream import Stream
 

@@ -17,8 +17,7 @@ from outside import watched
 
 import gapcert as gc
 import gapcert_figures
-from gapcert_closed_loop.parameter_sets import Learned
-from gapcert_closed_loop.prediction import Ahead, Foreseen
+from gapcert_closed_loop.prediction import Ahead, Foreseen, Learned
 from gapcert_figures.data import Axis, CompareFigure, Figures, LoopFigure, PairFigure, RecordedFigure, Runs, Stretch
 from gapcert_figures.playback import Motion, Playback
 from gapcert_figures.region_outlines import Outline

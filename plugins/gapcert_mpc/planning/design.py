@@ -2,22 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any, final, get_args, get_type_hints
 
 import numpy as np
 
-from gapcert import Array
-from gapcert_mpc.program.constraints import Preferred
+from gapcert.plugin import Array
 from gapcert_mpc.program.corridors import Scene
 from gapcert_mpc.program.linearise import Frame, Stages
-from gapcert_mpc.program.program import Program, Rows, Weights
+from gapcert_mpc.program.program import Preferred, Program, Rows, Weights
 from gapcert_mpc.program.tube import Section
 from gapcert_mpc.program.tuning import Tuning
 
 from .plans import Pool
-from .tracking import Course
+
+
+@final
+@dataclass(frozen=True)
+class Course:
+    """Steady references (T, n+m) in the frame, each wanted from its `first` (T,) step of a run on; the first of these is 0."""
+
+    first: Array
+    references: Array
+
+    def ahead(self, step: int, count: int) -> Array:
+        """(count, n+m): what is wanted at this step of a run and at those that follow."""
+        return np.asarray(self.references[np.searchsorted(self.first, step + np.arange(count), side="right") - 1])
+
+    def shown(self, frame: Frame, names: Sequence[str], period: float) -> list[dict[str, float]]:
+        """JSON-able: each reference in its units, with the time `from` which it is wanted, in s."""
+        at = [dict(zip(names, frame.out(z).tolist(), strict=True)) for z in self.references]
+        return [{"from": step * period, **z} for step, z in zip(self.first.tolist(), at, strict=True)]
 
 
 @final

@@ -9,8 +9,7 @@ from typing import Generic, NamedTuple, TypeVar, final
 
 import numpy as np
 
-from gapcert import Array
-from gapcert.plugin import Ints
+from gapcert.plugin import Array, Ints
 from gapcert_mpc.program.linearise import Stages
 from gapcert_mpc.program.program import Program
 

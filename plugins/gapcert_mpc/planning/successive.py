@@ -7,8 +7,7 @@ from typing import final
 
 import numpy as np
 
-from gapcert import Array
-from gapcert.plugin import Bools
+from gapcert.plugin import Array, Bools
 from gapcert_mpc.program.linearise import Frame, Nominal, Stages
 from gapcert_mpc.program.tube import Section, tightest
 from gapcert_mpc.thresholds import THRESHOLDS
@@ -195,9 +194,8 @@ class Successive:
         return replace(found, s=s, lines=stages)
 
     def _found(self, x: Array, stages: Stages) -> Plan | None:
-        program = self.engine.program
-        program.update(stages)
-        return self.engine.found(x, *self.engine.later[2:], A=program.A.data)
+        self.engine.program.update(stages)
+        return self.engine.found(x, *self.engine.later[2:], varied=True)
 
     def _begun(self, x: Array) -> Plan | None:
         """About a motion that is found without a bound of what lines leave out, with several boxes."""

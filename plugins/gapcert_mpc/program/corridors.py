@@ -9,14 +9,11 @@ from typing import final
 
 import numpy as np
 
-from gapcert import Array, Box, Ellipsoid, Goal, Polytope, Region
-from gapcert.plugin import Bools, Ints
+from gapcert.plugin import TURN, Array, Bools, Box, Ellipsoid, Goal, Ints, Polytope, Region
 from gapcert_mpc.thresholds import THRESHOLDS
 
 from .linearise import Frame
 from .program import Program, Rows
-
-TURN = 2 * np.pi
 
 
 @final

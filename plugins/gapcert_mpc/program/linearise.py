@@ -10,8 +10,7 @@ from typing import final
 import numpy as np
 
 import gapcert
-from gapcert import Array, GapFunction, Interval, Model
-from gapcert.plugin import Bools, majorant_of
+from gapcert.plugin import Array, Bools, Domain, GapFunction, Interval, Model, majorant_of
 from gapcert_mpc.thresholds import THRESHOLDS
 
 
@@ -151,6 +150,34 @@ class Nominal:
         one = in_frame(frame, *(a[None] for a in units), *(frame.into(a)[None] for a in (centre, low, high)))
         return one.repeated(horizon + 1)
 
+    def featured(self, zone: Domain, horizon: int, frame: Frame, constant: bool) -> tuple[Stages, Array]:
+        """(stages, F (f, n+m)): one straight line for a whole zone and all stages; |w_i| ≤ c_i + Σ_j G_ij |F_j(z − ẑ)|.
+
+        F has the axes of z for what the line leaves out; and for the gap the coordinates that it is bounded in, where these are
+        relative ones, d = u − v say. With d bounded by itself, fast motion at d = 0 is as certain as rest.
+        """
+        low, high = zone.low, zone.high
+        centre, slope, left_out = self.line(low, high)
+        relative = getattr(self.gap, "relative", None)
+
+        def wrong(cells: Interval) -> Interval:
+            return left_out(cells) if relative is not None else left_out(cells) + self.left(cells)
+
+        parts = [(*_bounded(wrong, zone, centre, constant), np.eye(len(low)))]
+        if relative is not None:
+            C = np.eye(len(low))
+            C[self.nx :] = np.hstack([np.asarray(relative.slope), np.diag(relative.scale)])
+            left = self.gap.inner.remainder_over  # type: ignore[union-attr]
+            parts.append((*_bounded(left, relative.domain(zone), C @ centre, constant), C))
+        shift, c = (np.sum([p[i] for p in parts], axis=0) for i in (0, 1))
+        G, F = np.hstack([p[2] for p in parts]), np.vstack([p[3] for p in parts]) * frame.half
+        used = G.any(axis=0)
+        size = np.abs(F[used]).max(axis=1)
+        units = slope, self(centre[None])[0] + shift, c, np.zeros_like(slope)
+        one = in_frame(frame, *(a[None] for a in units), *(frame.into(a)[None] for a in (centre, low, high)))
+        one = replace(one, G=(G[:, used] * size / frame.x[1][:, None])[None])
+        return one.repeated(horizon + 1), F[used] / size[:, None]
+
     def line(self, low: Array, high: Array) -> tuple[Array, Array, Callable[[Interval], Interval]]:
         """(ẑ (nz,), J (nx, nz), e): the middles of a box and of ∂F/∂z over it; e(cells) contains F(z) − F(ẑ) − J(z − ẑ).
 
@@ -207,6 +234,22 @@ class Nominal:
             return after, error
         known = self.predictor.over(Interval.exact(z))
         return after + known.mid, error + known.rad
+
+
+def _bounded(error: Callable[[Interval], Interval], zone: Domain, centre: Array, constant: bool) -> tuple[Array, Array, Array]:
+    """(shift, c, G): |error − shift|_i ≤ c_i + Σ_j G_ij |z_j − centre_j| in the zone."""
+    cells = tiles(zone.low, zone.high)
+    ends = error(cells[~zone.outside(cells)])
+    top, bottom = ends.hi.max(axis=0), ends.lo.min(axis=0)
+    shift = np.where(np.isfinite(top + bottom), (top + bottom) / 2, 0.0)
+
+    def bound(cells: Interval) -> Array:
+        return np.where(zone.outside(cells)[:, None], 0.0, (error(cells) - shift).mag)
+
+    if constant or not np.isfinite(top - bottom).all():
+        return shift, (ends - shift).mag.max(axis=0), np.zeros((ends.shape[1], len(centre)))
+    mean = THRESHOLDS.majorant_near * (zone.high - zone.low) / 4
+    return shift, *majorant_of(bound, zone.low, zone.high, centre, mean=mean)
 
 
 def in_frame(frame: Frame, slope: Array, value: Array, c: Array, G: Array, zeta: Array, low: Array, high: Array) -> Stages:

@@ -10,13 +10,11 @@ from typing import final
 import numpy as np
 import scipy.sparse as sp
 
-from gapcert import Array
-from gapcert.plugin import Ints
+from gapcert.plugin import Array, Ints
 from gapcert_mpc.thresholds import THRESHOLDS
 
-from .constraints import Preferred
 from .linearise import Stages
-from .solver import Piqp
+from .solver import Piqp, Qp
 from .tube import Section
 
 
@@ -44,6 +42,18 @@ class Rows:
     C: Array
     low: Array
     high: Array
+
+
+@final
+@dataclass(frozen=True)
+class Preferred:
+    """low ≤ z_j ≤ high is preferred for the j in `axis`, each (q,), in the frame; an excess e costs linear·e + quadratic·e²."""
+
+    axis: Array
+    low: Array
+    high: Array
+    linear: Array
+    quadratic: Array
 
 
 @final
@@ -175,6 +185,11 @@ class Program:
         return np.asarray(np.abs(self.section.H).sum(axis=1) * self.tolerance)
 
     @property
+    def qp(self) -> Qp:
+        """As a solver takes it: for the start, the reference and the bounds that were set last."""
+        return Qp(self.P, self.q, self.A, self.low, self.high)
+
+    @property
     def size(self) -> int:
         return int(self.at["end"][0])
 
@@ -191,7 +206,7 @@ class Program:
         # The tube where it does not depend on the plan, else 0 but for s₀.
         self.constant = np.vstack([self.s0, np.zeros((N, self.p))])
         if not self.variable:
-            self.constant = self.tube(np.zeros((N, len(self.F))))
+            self.constant = self.tube()
         table, at = Table(), self.at
         self.start = table.rows(np.zeros((1, n)), np.zeros((1, n)))
         table.put("start", self.start, at["x"][:1], np.eye(n))
@@ -252,8 +267,9 @@ class Program:
         else:
             self.low[self.lower[down]] = np.maximum(low, -THRESHOLDS.loose_bound)[down] + self.off[down]
 
-    def tube(self, away: Array) -> Array:
-        """s (N+1, p) of a plan with a_k = away (≥ N, f)."""
+    def tube(self, away: Array | None = None) -> Array:
+        """s (N+1, p) of a plan with a_k = away (≥ N, f), by default 0: of one at rest where G has its centre."""
+        away = np.zeros((self.N, len(self.F))) if away is None else away
         s = np.vstack([self.s0, np.zeros((self.N, self.p))])
         for k in range(self.N):
             s[k + 1] = self.grown[k] @ s[k] + self.spread[k] + np.abs(self.section.H) @ self.stages.G[k] @ away[k]
@@ -380,7 +396,8 @@ class Program:
         A = self.A[kept][:, columns]
         goal, weight = np.zeros(len(columns)), np.full(len(columns), 1e-9)
         goal[: n + m], weight[: n + m] = z, np.maximum(weights, 1e-6)
-        found = Piqp(sp.diags(weight, format="csc"), -weight * goal, A, self.low[kept], self.high[kept], 1e-8).solve()
+        qp = Qp(sp.diags(weight, format="csc"), -weight * goal, A, self.low[kept], self.high[kept])
+        found = Piqp(qp, 1e-8).solve()
         return found.z[: n + m] if found.status == "solved" else None
 
     # -- cost -------------------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Quadratic programs min ½zᵀPz + qᵀz, low ≤ Az ≤ high behind one small face: set up once, data updated in place."""
+"""Quadratic programs, and who solves them behind one small face: set up once, data updated in place."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ from typing import Any, Literal, NamedTuple, final
 import numpy as np
 import scipy.sparse as sp
 
-from gapcert import Array, MissingDependency, UsageError
+from gapcert.plugin import Array, MissingDependency, UsageError
 
 Name = Literal["osqp", "piqp", "clarabel"]
-Choice = Literal["auto", "osqp", "piqp", "clarabel"]
 Status = Literal["solved", "infeasible", "unfinished"]
-FREE = 1e20
 
 
 @final
@@ -26,8 +24,19 @@ class Answer(NamedTuple):
     iterations: int
 
 
+@final
+class Qp(NamedTuple):
+    """min ½zᵀPz + qᵀz subject to low ≤ Az ≤ high; P upper triangular (n, n) and A (rows, n)."""
+
+    P: sp.csc_matrix
+    q: Array
+    A: sp.csc_matrix
+    low: Array
+    high: Array
+
+
 class QpSolver(ABC):
-    """P upper triangular (n, n), A (m, n) of a fixed pattern.
+    """For a program, and for others with the same P and the same pattern of A.
 
     Rows with low = high when it is set up stay equations, and those without a bound have none.
     """
@@ -37,13 +46,11 @@ class QpSolver(ABC):
     bad: tuple[Any, ...]
 
     @abstractmethod
-    def __init__(self, P: sp.csc_matrix, q: Array, A: sp.csc_matrix, low: Array, high: Array, tolerance: float) -> None: ...
+    def __init__(self, qp: Qp, tolerance: float) -> None: ...
 
     @abstractmethod
-    def update(
-        self, *, q: Array | None = None, low: Array | None = None, high: Array | None = None, A: Array | None = None
-    ) -> None:
-        """New vectors, or new values (in CSC order) of A."""
+    def update(self, qp: Qp, varied: bool = False) -> None:
+        """Other vectors, and other values of A where it is `varied`."""
 
     @abstractmethod
     def solve(self, z: Array | None = None, y: Array | None = None) -> Answer:
@@ -62,32 +69,20 @@ class Osqp(QpSolver):
     name, solved, bad = "osqp", 1, (3, 4)
     MOST = 60  # beyond it an interior point method is sooner there
 
-    def __init__(
-        self,
-        P: sp.csc_matrix,
-        q: Array,
-        A: sp.csc_matrix,
-        low: Array,
-        high: Array,
-        tolerance: float,
-        rho: float = 0.1,
-        alpha: float = 1.6,
-    ) -> None:
+    def __init__(self, qp: Qp, tolerance: float, rho: float = 0.1, alpha: float = 1.6) -> None:
         self.osqp = _library("osqp").OSQP()
         # An adaptive ρ would make an answer depend on what was solved before.
         self.osqp.setup(
-            P, q, A, low, high, verbose=False, eps_abs=tolerance / 2, eps_rel=0.0, max_iter=self.MOST, adaptive_rho=0, rho=rho,
+            *qp, verbose=False, eps_abs=tolerance / 2, eps_rel=0.0, max_iter=self.MOST, adaptive_rho=0, rho=rho,
             alpha=alpha, check_termination=5, polishing=False, warm_starting=True, scaling=10,
         )  # fmt: skip
         # What is updated is scaled by other roundings than what is set up.
-        self.osqp.update(q=q, l=low, u=high)
+        self.update(qp)
 
-    def update(
-        self, *, q: Array | None = None, low: Array | None = None, high: Array | None = None, A: Array | None = None
-    ) -> None:
-        if A is not None:
-            self.osqp.update(Ax=A)
-        self.osqp.update(q=q, l=low, u=high)
+    def update(self, qp: Qp, varied: bool = False) -> None:
+        if varied:
+            self.osqp.update(Ax=qp.A.data)
+        self.osqp.update(q=qp.q, l=qp.low, u=qp.high)
 
     def solve(self, z: Array | None = None, y: Array | None = None) -> Answer:
         if z is not None:
@@ -103,9 +98,9 @@ class Piqp(QpSolver):
     name = "piqp"
     MOST = 60  # it takes 10, or is on the edge of what is feasible
 
-    def __init__(self, P: sp.csc_matrix, q: Array, A: sp.csc_matrix, low: Array, high: Array, tolerance: float) -> None:
+    def __init__(self, qp: Qp, tolerance: float) -> None:
         piqp = _library("piqp")
-        self.low, self.high = low.copy(), high.copy()
+        P, q, A, low, high = qp
         self.equal = low == high
         self.rest = ~self.equal & (np.isfinite(low) | np.isfinite(high))
         self.piqp = piqp.SparseSolver()
@@ -123,25 +118,18 @@ class Piqp(QpSolver):
         self.solved = piqp.PIQP_SOLVED
         self.bad = (piqp.PIQP_PRIMAL_INFEASIBLE, piqp.PIQP_DUAL_INFEASIBLE)
 
-    def update(
-        self, *, q: Array | None = None, low: Array | None = None, high: Array | None = None, A: Array | None = None
-    ) -> None:
+    def update(self, qp: Qp, varied: bool = False) -> None:
         e, rest = self.equal, self.rest
-        parts: dict[str, Any] = {} if q is None else {"c": q}
-        if A is not None:
-            for name, part, where in self.parts:
-                part.data[:] = A[where]
-                parts[name] = part
-        if low is not None:
-            parts |= {"b": low[e], "h_l": low[rest]}
-        if high is not None:
-            parts |= {"h_u": high[rest]}
-        self.piqp.update(**parts)
+        parts: dict[str, Any] = {}
+        for name, part, where in self.parts if varied else ():
+            part.data[:] = qp.A.data[where]
+            parts[name] = part
+        self.piqp.update(c=qp.q, b=qp.low[e], h_l=qp.low[rest], h_u=qp.high[rest], **parts)
 
     def solve(self, z: Array | None = None, y: Array | None = None) -> Answer:
         found = self.piqp.solve()
         r = self.piqp.result
-        dual = np.zeros(len(self.low))
+        dual = np.zeros(len(self.equal))
         dual[self.equal] = r.y
         dual[self.rest] = r.z_u - r.z_l
         return self._answer(r.x, dual, found, r.info.iter)
@@ -153,10 +141,9 @@ class Clarabel(QpSolver):
 
     name = "clarabel"
 
-    def __init__(self, P: sp.csc_matrix, q: Array, A: sp.csc_matrix, low: Array, high: Array, tolerance: float) -> None:
+    def __init__(self, qp: Qp, tolerance: float) -> None:
         clarabel = _library("clarabel")
-        self.equal = low == high
-        self.A, self.scale = A, FREE
+        self.equal = qp.low == qp.high
         settings = clarabel.DefaultSettings()
         settings.verbose = False
         settings.presolve_enable = False
@@ -164,31 +151,21 @@ class Clarabel(QpSolver):
         settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance / 100
         rest = ~self.equal
         cones = [clarabel.ZeroConeT(int(self.equal.sum())), clarabel.NonnegativeConeT(2 * int(rest.sum()))]
-        self.clarabel = clarabel.DefaultSolver(P, q, self._rows(), self._right(low, high), cones, settings)
+        self.clarabel = clarabel.DefaultSolver(qp.P, qp.q, self._rows(qp.A), self._right(qp), cones, settings)
         self.solved = clarabel.SolverStatus.Solved
         self.bad = (clarabel.SolverStatus.PrimalInfeasible, clarabel.SolverStatus.DualInfeasible)
-        self.low, self.high = low.copy(), high.copy()
 
-    def _rows(self) -> sp.csc_matrix:
-        rest = self.A[~self.equal]
-        return sp.csc_matrix(sp.vstack([self.A[self.equal], rest, -rest], format="csc"))
+    def _rows(self, A: sp.csc_matrix) -> sp.csc_matrix:
+        rest = A[~self.equal]
+        return sp.csc_matrix(sp.vstack([A[self.equal], rest, -rest], format="csc"))
 
-    def _right(self, low: Array, high: Array) -> Array:
+    def _right(self, qp: Qp) -> Array:
         e = self.equal
-        return np.asarray(np.clip(np.concatenate([low[e], high[~e], -low[~e]]), -1e6, 1e6))
+        return np.asarray(np.clip(np.concatenate([qp.low[e], qp.high[~e], -qp.low[~e]]), -1e6, 1e6))
 
-    def update(
-        self, *, q: Array | None = None, low: Array | None = None, high: Array | None = None, A: Array | None = None
-    ) -> None:
-        self.low = self.low if low is None else low.copy()
-        self.high = self.high if high is None else high.copy()
-        parts: dict[str, Any] = {} if q is None else {"q": q}
-        if A is not None:
-            self.A.data[:] = A
-            parts["A"] = self._rows().data
-        if low is not None or high is not None:
-            parts["b"] = self._right(self.low, self.high)
-        self.clarabel.update(**parts)
+    def update(self, qp: Qp, varied: bool = False) -> None:
+        rows = {"A": self._rows(qp.A).data} if varied else {}
+        self.clarabel.update(q=qp.q, b=self._right(qp), **rows)
 
     def solve(self, z: Array | None = None, y: Array | None = None) -> Answer:
         found = self.clarabel.solve()
@@ -212,8 +189,8 @@ def _library(name: str) -> Any:
 SOLVERS: dict[str, type[QpSolver]] = {"osqp": Osqp, "piqp": Piqp, "clarabel": Clarabel}
 
 
-def solver(name: Name, *data: Any, **settings: Any) -> QpSolver:
+def solver(name: Name, qp: Qp, tolerance: float, **settings: Any) -> QpSolver:
     """One of SOLVERS by its name; the settings are its own."""
     if name not in SOLVERS:
         raise UsageError(f"controller.solver: '{name}' is unknown; use one of {', '.join(SOLVERS)}")
-    return SOLVERS[name](*data, **settings)
+    return SOLVERS[name](qp, tolerance, **settings)

@@ -9,8 +9,10 @@ from typing import final
 import numpy as np
 import scipy.linalg
 
-from gapcert import Array, UsageError
+from gapcert.plugin import Array, UsageError
 from gapcert_mpc.thresholds import THRESHOLDS
+
+from .linearise import Stages
 
 
 @final
@@ -184,6 +186,20 @@ def settled(closed: Array, rows: Array, c: Array, G: Array, whole: Array, away: 
     return np.asarray(own @ (c + G @ (away + e)))
 
 
+def grown(closed: Array, rows: Array, c: Array, G: Array, whole: Array, steps: int) -> Array:
+    """(r,): the exact half-widths along rows (r, n) after so many steps; w_k = c + G(`majorant_near` + e_k), e_k those along
+    `whole`."""
+    terms = [np.vstack([rows, whole])]
+    for _ in range(steps - 1):
+        terms.append(terms[-1] @ closed)
+    size, w, e = np.abs(np.array(terms)), np.empty((steps, len(c))), np.zeros(len(whole))
+    for k in range(steps):
+        w[k] = c + G @ (THRESHOLDS.majorant_near + e)
+        total = np.einsum("krn,kn->r", size[: k + 1], w[k::-1])
+        e = total[len(rows) :]
+    return np.asarray(total[: len(rows)])
+
+
 def tightest(
     A: Array, B: Array, c: Array, G: Array, rows: Array, away: float = 0.5, rates: Array | None = None
 ) -> tuple[Section, Array]:
@@ -220,6 +236,48 @@ def tightest(
     return Section.of(A, B, gain(found[1])), found[2]
 
 
+def passing(stages: Stages, F: Array, rows: Array) -> Section:
+    """The section whose tube leaves most of the rows (r, n + m), each scaled to 1, at the horizon; it need not shrink.
+
+    Linear-quadratic regulators are tried as `tightest` does, by what a tube needs at least and then by what their sections
+    need, with a weight on each of F (f, n + m) as well: a feedback that leaves what the uncertainty depends on alone may be
+    worth more than one that contracts.
+    """
+    (A, B, c, G), steps = stages.first, stages.horizon
+    n, m = B.shape
+
+    def gain(logs: Array) -> Array:
+        # The scale is free: the first weight is that of the first of F, the last that of the last input.
+        cost = np.diag(np.exp(logs[len(F) :])) + F.T @ (np.exp(logs[: len(F), None] - 8.0) * F)
+        S, R = cost[:n, n:], cost[n:, n:]
+        X = scipy.linalg.solve_discrete_are(A, B, cost[:n, :n], R, s=S)
+        return np.asarray(-np.linalg.solve(R + B.T @ X @ B, B.T @ X @ A + S.T))
+
+    def least(logs: Array) -> Array:
+        feedback = np.vstack([np.eye(n), gain(logs)])
+        return grown(A + B @ feedback[n:], rows @ feedback, c, G, F @ feedback, steps)
+
+    def own(logs: Array) -> Array:
+        return kept(Section.of(A, B, gain(logs)), c, G, F, rows, steps)
+
+    def flat(logs: Array) -> Array:
+        return kept(Section.of(A, B, gain(logs)), c + G.sum(axis=1) * THRESHOLDS.majorant_near, 0 * G, F, rows, steps)
+
+    def shares(of: Callable[[Array], Array]) -> Callable[[Array], Array]:
+        def tried(logs: Array) -> Array:
+            try:
+                return of(logs)
+            except (np.linalg.LinAlgError, ValueError):
+                return np.full(len(rows), np.inf)
+
+        return tried
+
+    start = np.zeros(len(F) + n + m)
+    starts = [start, *(searched(shares(of), start)[1] for of in (least, flat))]
+    found = min((searched(shares(own), logs) for logs in starts), key=lambda found: found[0])
+    return Section.of(A, B, gain(found[1]))
+
+
 def taken(section: Section, c: Array, G: Array, rows: Array, away: float = 0.5, rates: Array | None = None) -> Array:
     """(r,): what a section's steady tube takes of rows that are scaled to a half-width of 1; infinite where it grows.
 
@@ -233,6 +291,18 @@ def taken(section: Section, c: Array, G: Array, rows: Array, away: float = 0.5, 
         return held
     turned = section.turning(section.closed) @ size + np.abs(section.K) @ (c + G @ (away + section.support @ size))
     return np.concatenate([held, turned / rates])
+
+
+def kept(section: Section, c: Array, G: Array, F: Array, rows: Array, steps: int) -> Array:
+    """(r,): what the tube of a section takes of the rows (r, n + m), each scaled to 1, after so many steps; it is that of a
+    plan whose features are at `majorant_near`.
+    """
+    size = np.abs(section.H)
+    moved = np.abs(section.moved) + size @ G @ np.abs(F @ section.feedback)
+    s, w = np.zeros(len(size)), size @ (c + G.sum(axis=1) * THRESHOLDS.majorant_near)
+    for _ in range(steps):
+        s = moved @ s + w
+    return np.asarray(np.abs(rows @ section.feedback) @ s)
 
 
 def searched(shares: Callable[[Array], Array], logs: Array) -> tuple[float, Array, Array]:

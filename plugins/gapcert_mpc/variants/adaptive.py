@@ -11,8 +11,7 @@ from typing import Any, NamedTuple, final
 
 import numpy as np
 
-from gapcert import Array, Controller, Goal, Interval, SynthesisProblem
-from gapcert.plugin import Bools, Ints, Policy
+from gapcert.plugin import Array, Bools, Controller, Goal, Interval, Ints, Policy, SynthesisProblem
 from gapcert_cells import write_saved
 from gapcert_mpc.controller import MpcController, loaded
 from gapcert_mpc.planning.plans import Memory
@@ -21,8 +20,7 @@ from gapcert_mpc.saved_models import known, pair
 from gapcert_mpc.task import Task
 from gapcert_mpc.thresholds import THRESHOLDS
 
-from .membership import Membership
-from .parameters import Family
+from .parameters import Family, Membership
 
 Key = tuple[tuple[int, int, int], ...]
 Maker = Callable[[SynthesisProblem, MpcController | None], MpcController]
@@ -272,13 +270,13 @@ class AdaptiveMpcController(Controller):
         return loaded(folder, made)
 
 
-def adaptive(task: Task, make: Maker) -> Controller:
-    """For parameters in the ranges that are asked for.
+def adaptive(task: Task, of_boxes: Mapping[str, Any], make: Maker) -> Controller:
+    """For parameters in the ranges that are asked for; of_boxes: the options by which `make` makes controllers.
 
     Without a gap the model is trusted as it is, at the middle of the ranges: nothing is learned then.
     """
     problem, options = task.problem, task.options
-    levels = Levels(family := Family.of(problem, options.adapt), options.of_boxes, options.levels, make)
+    levels = Levels(family := Family.of(problem, options.adapt), of_boxes, options.levels, make)
     first = levels[levels.first]
     if problem.gap is None or not first.wins:
         return first

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from copy import copy
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -13,8 +12,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 import scipy.linalg
 
-from gapcert import Array, Controller, Goal, UsageError
-from gapcert.plugin import Bools
+from gapcert.plugin import Array, Bools, Controller, Goal, UsageError
 from gapcert_cells import write_saved
 from gapcert_mpc.controller import MpcController, PlanController, loaded
 from gapcert_mpc.planning.design import Design
@@ -23,8 +21,7 @@ from gapcert_mpc.task import Task
 from gapcert_mpc.thresholds import THRESHOLDS
 
 from .regulation import regulating
-from .sls import SlsSolver
-from .sls_problem import LtvProblem, SlsPlan
+from .sls import LtvProblem, SlsPlan, SlsSolver
 
 
 @final
@@ -261,12 +258,11 @@ class DisturbanceMpcController(PlanController[Run]):
 
 def answering(task: Task) -> Controller:
     """The controller with feedback from disturbances of the design that one gain has; that one itself where it wins nowhere."""
-    options = copy(task.options)
     # What it bounds is a constant, and no quadratic program is solved.
-    options.majorant, options.starts = "constant", 1
-    if not (fixed := regulating(replace(task, options=options))).wins:
+    options = task.options.model_copy(update={"majorant": "constant"})
+    if not (fixed := regulating(replace(task, options=options, starts=1))).wins:
         return fixed
-    x = task.drawn(np.random.default_rng(task.problem.seed), task.options.starts)
+    x = task.drawn(np.random.default_rng(task.problem.seed), task.starts)
     share = float(DisturbanceMpcController(fixed).contains(x).mean())
     told = dict(fixed.evidence) | {"feedback": "disturbance", "domain_fraction": share}
     return DisturbanceMpcController(replace(fixed, evidence=told))

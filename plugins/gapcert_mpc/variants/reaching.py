@@ -6,15 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from gapcert import Array
-from gapcert.plugin import Pulse
+from gapcert.plugin import Array, Pulse
 from gapcert_mpc.controller import MpcController, looked
 from gapcert_mpc.planning.arrival import Arrival
 from gapcert_mpc.planning.design import Design
 from gapcert_mpc.planning.engine import Engine
 from gapcert_mpc.program.corridors import scene
-from gapcert_mpc.program.features import featured, passing
 from gapcert_mpc.program.solver import Name
+from gapcert_mpc.program.tube import passing
 from gapcert_mpc.task import Task
 from gapcert_mpc.thresholds import THRESHOLDS
 
@@ -24,7 +23,7 @@ def reaching(task: Task) -> MpcController:
     problem, options, frame = task.problem, task.options, task.frame
     goal, nx, searches, horizon = problem.goal, frame.nx, options.searches, options.horizon
     task.tell("successors along the model's lines")
-    stages, F = featured(task.nominal, task.zone, horizon, frame, options.majorant == "constant")
+    stages, F = task.nominal.featured(task.zone, horizon, frame, options.majorant == "constant")
     if (reason := task.unbounded(stages)) is not None:
         return task.nothing(reason)
     rows, areas = scene(goal, frame, task.rows, F)
@@ -42,7 +41,7 @@ def reaching(task: Task) -> MpcController:
     if not len(pool.arrival):
         return task.nothing(f"from none of {searches} starts a plan of {horizon} steps reaches the target with its whole tube")
     made = MpcController(goal, replace(design, pool=pool), {}, solver)
-    fraction = float(looked(made, task.drawn(rng, min(options.starts, THRESHOLDS.starts)), problem.emit).mean())
+    fraction = float(looked(made, task.drawn(rng, min(task.starts, THRESHOLDS.starts)), problem.emit).mean())
     tube = half_widths(design)
     evidence = {
         "horizon": horizon,
@@ -56,6 +55,4 @@ def reaching(task: Task) -> MpcController:
 
 def half_widths(design: Design) -> Array:
     """(N + 1, n + m), in the model's units: the tube around a plan at rest, before γ of a motion widens it."""
-    assert design.scene is not None, "who reaches a target knows its scene"
-    size = design.program().tube(np.zeros((design.stages.horizon + 1, len(design.scene.F))))
-    return np.asarray(size @ design.section.support.T * design.frame.half)
+    return np.asarray(design.program().tube() @ design.section.support.T * design.frame.half)

@@ -7,14 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from gapcert import Array
+from gapcert.plugin import Array, Interval
 from gapcert_mpc.controller import MpcController, looked
-from gapcert_mpc.invariant import margin
-from gapcert_mpc.planning import tracking
-from gapcert_mpc.planning.design import Design
+from gapcert_mpc.planning.design import Course, Design
+from gapcert_mpc.planning.requirements import limits, moments, preferred
 from gapcert_mpc.planning.successive import Ending
-from gapcert_mpc.program.constraints import limits, preferred
-from gapcert_mpc.program.linearise import Stages
+from gapcert_mpc.program.linearise import Frame, Nominal, Stages
 from gapcert_mpc.program.program import NotShrinking
 from gapcert_mpc.program.solver import Name
 from gapcert_mpc.program.tube import Section, taken, tightest
@@ -60,7 +58,7 @@ def regulating(task: Task, like: MpcController | None = None) -> MpcController:
     elif options.solver != "auto":
         name = options.solver
     made = MpcController(problem.goal, design, {}, name, nominal=nominal if design.successive else None)
-    x = task.drawn(np.random.default_rng(problem.seed), options.starts)
+    x = task.drawn(np.random.default_rng(problem.seed), task.starts)
     evidence["domain_fraction"] = float(looked(made, x, problem.emit).mean())
     return replace(made, evidence=evidence)
 
@@ -81,7 +79,7 @@ def _section(stages: Stages, rows: Array, like: MpcController | None, rates: Arr
 
 def _design(task: Task, stages: Stages, section: Section, rates: Array | None) -> Design | str:
     options, domain, frame = task.options, task.problem.domain, task.frame
-    moments = tracking.moments(options.reference, task.problem.model.period)
+    steps = moments(options.reference, task.problem.model.period)
     weights, successive, nowhere = task.weights(stages), options.linearisation == "successive", np.zeros(len(frame.half))
     soft = preferred(options.soft, domain, frame, weights.T[0, 0] / THRESHOLDS.rest_weight)
     design = Design(frame, stages, section, task.rows, weights, nowhere, options.tolerance, successive, rates=rates)
@@ -89,11 +87,11 @@ def _design(task: Task, stages: Stages, section: Section, rates: Array | None) -
         program = design.program()
     except NotShrinking as error:
         return f"the tube grows without end: by {error.args[0]:.4g} per step; narrow the goal, or shorten the period"
-    found = [program.target(*task.wanted(step)) for step in moments]
+    found = [program.target(*task.wanted(step)) for step in steps]
     if (first := found[0]) is None:
         reason = "no steady state keeps its tube within the goal; widen the goal, or give the input more authority"
         return reason if successive else f"{reason}, or use {_HINT}"
-    course = tracking.Course(np.array(moments), np.array(found)) if len(found) > 1 else None
+    course = Course(np.array(steps), np.array(found)) if len(found) > 1 else None
     return replace(design, reference=first, course=course, soft=soft)
 
 
@@ -130,3 +128,45 @@ def _too_wide(task: Task, section: Section, shares: Array) -> str:
 
 
 _HINT = "`linearisation: successive`, which makes the model straight about each plan alone"
+
+
+def margin(nominal: Nominal, frame: Frame, section: Section, x: Array, u: Array, size: Array) -> float:
+    """min_i 1 − b_i / σ_i; positive proves {|H(ξ − x)| ≤ σ} robustly invariant under u + K(ξ − x), all in the frame.
+
+    With z_s = (x, u), ξ = x + e, the mean value theorem gives F(ξ, ·) − F(z_s) = M e, M in the hull of F′ [I; K] over the set,
+    and |H(F − x + g)| ≤ |ΛHe| + |(HM − ΛH) e| + |H(F(z_s) − x)| + |H| γ̄ ≤ b for any Λ: γ̄ bounds what is left over the set.
+    """
+    H, P, K, n = section.H, section.P, section.K, len(x)
+    # |e| ≤ |P||He| + |I − PH||e|: the second is rounding, and solved for.
+    defect = (Interval.exact(np.eye(n)) - _product(P, H)).mag.sum(axis=1).max()
+    if not defect < 0.5:
+        return -np.inf
+    wide = _times(P, size)
+    spare = np.full(n, wide.max() * (2 * defect + 1e-12))
+    e = wide + spare
+    # K e = KP He + K (I − PH) e, and |KP||He| may be far below |K||P||He|.
+    away = np.concatenate([e, _times(_product(K, P).mag, size) + _times(K, spare)]) * (1 + 1e-12)
+    z = np.concatenate([x, u])
+    middle, half = Interval.exact(frame.middle), Interval.exact(frame.half)
+    box = (middle + half * Interval.around(z, away))[None]
+    at = (middle + half * Interval.exact(z))[None]
+    x_half, x_middle = Interval.exact(frame.x[1]), Interval.exact(frame.x[0])
+    J = nominal.slopes(box)[0] * half / x_half.reshape(n, 1)
+    M = J[:, :n] + (J[:, n:, None] * Interval.exact(K)[None]).sum(1)
+    lost = (Interval.exact(H)[:, :, None] * M[None]).sum(1)
+    moved = section.moved + H @ (M.mid - section.closed) @ P
+    rest = (lost - _product(moved, H)).mag
+    # Together: what is left may lie on one side, and x be steady with the middle of it.
+    off = ((nominal.enclosed(at)[0] + nominal.left(box)[0] - x_middle) / x_half - Interval.exact(x)).mag
+    bound = _times(moved, size) + _times(rest, e) + _times(H, off)
+    return float((1 - bound / size).min())
+
+
+def _product(A: Array, B: Array) -> Interval:
+    """Contains A B."""
+    return (Interval.exact(A)[:, :, None] * Interval.exact(B)[None]).sum(1)
+
+
+def _times(A: Array, b: Array) -> Array:
+    """≥ |A| b."""
+    return np.asarray((Interval.exact(np.abs(A)) * Interval.exact(b)).sum(1).hi)

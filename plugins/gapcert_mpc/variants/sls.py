@@ -7,20 +7,230 @@ boxes, so that tightenings are 1-norms, and the program is solved by an interior
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, final
+from copy import copy
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Array, UsageError
-from gapcert.plugin import Ints
+from gapcert.plugin import Array, Bools, Ints, UsageError
 from gapcert_mpc.thresholds import THRESHOLDS
 
 from . import sls_kernels as kernels
-from .sls_problem import LtvProblem, SlsPlan, SlsRefusal
-from .sls_trajectories import Condensed, limits_of, verified
 
+# N stages, n states, m inputs, c rows of a stage and e rows of the end.
+_SHAPES = {
+    "A": "Nnn",
+    "B": "Nnm",
+    "x0": "n",
+    "Q": "Nnn",
+    "R": "Nmm",
+    "Q_end": "nn",
+    "d": "Nn",
+    "r": "Nn",
+    "x_ref": "Mn",
+    "u_ref": "Nm",
+    "Cx": "Ncn",
+    "Cu": "Ncm",
+    "Cp": "Ncm",
+    "h": "Nc",
+    "low": "Nc",
+    "C_end": "en",
+    "h_end": "e",
+    "low_end": "e",
+    "u_before": "m",
+}
+_LIMITS = {"h", "low", "h_end", "low_end"}
+_WEIGHTS = {"Q", "R", "Q_end"}
 _DYNAMICS = {"A", "B", "Q", "R", "Q_end", "Cx", "Cu", "Cp", "C_end"}
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class LtvProblem:
+    """x_{k+1} = A_k x_k + B_k u_k + d_k + w_k with |w_k| ≤ r_k, k = 0 … N − 1, from x₀; rows, and a quadratic cost.
+
+    Rows: low_k ≤ Cx_k x_k + Cu_k u_k + Cp_k u_{k−1} ≤ h_k at k < N (u_{−1} = `u_before`; Cp bounds rates) and
+    low_end ≤ C_end x_N ≤ h_end, for all disturbances; infinite limits are none.
+
+    Cost: ½ Σ_k |x_k − x_ref,k|²_Q + |u_k − u_ref,k|²_R + ½ |x_N − x_ref,N|²_{Q_end} of the nominal trajectory (w = 0), plus
+    `response_weight` times the same quadratic, without references, of each response to one disturbance alone at its bound,
+    Φ_{·,j} e_i r_{j,i}. With 1/3, the default, this is the expectation of the cost over independent disturbances that are
+    uniform on their boxes.
+
+    Shapes: A (N, n, n), B (N, n, m), d and r (N, n), x_ref (N + 1, n), u_ref (N, m), Cx (N, c, n), Cu and Cp (N, c, m), h and
+    low (N, c), C_end (e, n), h_end and low_end (e), Q (N, n, n), R (N, m, m), Q_end (n, n). All but B may lack leading axes,
+    which are repeated then. Q and Q_end are positive semidefinite, R is positive definite. Raises UsageError for other shapes
+    and values.
+    """
+
+    A: Array
+    B: Array
+    x0: Array
+    Q: Array
+    R: Array
+    Q_end: Array
+    d: Any = 0.0
+    r: Any = 0.0
+    x_ref: Any = 0.0
+    u_ref: Any = 0.0
+    Cx: Any = None
+    Cu: Any = None
+    Cp: Any = None
+    h: Any = np.inf
+    low: Any = -np.inf
+    C_end: Any = None
+    h_end: Any = np.inf
+    low_end: Any = -np.inf
+    u_before: Any = 0.0
+    response_weight: float = 1 / 3
+
+    def __post_init__(self) -> None:
+        B = np.asarray(self.B, float)
+        if B.ndim != 3:
+            raise UsageError(f"LtvProblem: B has shape {B.shape}; it needs (stages, states, inputs)")
+        stage_rows = [np.shape(C)[-2] for C in (self.Cx, self.Cu, self.Cp) if np.ndim(C) >= 2]
+        N, n, m = B.shape
+        sizes = {"N": N, "M": N + 1, "n": n, "m": m, "c": max(stage_rows, default=0)}
+        sizes["e"] = np.shape(self.C_end)[-2] if np.ndim(self.C_end) >= 2 else 0
+        for name in _SHAPES:
+            self._set(name, getattr(self, name), sizes)
+        if not 0 < self.response_weight < np.inf:
+            raise UsageError(f"LtvProblem: response_weight is {self.response_weight}; it needs to be positive")
+
+    def _set(self, name: str, value: Any, sizes: dict[str, int]) -> None:
+        shape = tuple(sizes[c] for c in _SHAPES[name])
+        try:
+            given = np.asarray(0.0 if value is None else value, float)
+            array = np.ascontiguousarray(np.broadcast_to(given, shape))
+        except (TypeError, ValueError):
+            raise UsageError(f"LtvProblem: {name} has shape {np.shape(value)}; it needs {shape}") from None
+        if np.isnan(array).any() or (name not in _LIMITS and np.isinf(array).any()):
+            raise UsageError(f"LtvProblem: {name} has values that are not finite")
+        if name == "r" and (array < 0).any():
+            raise UsageError("LtvProblem: r has negative values; radii of boxes are 0 or more")
+        if name in _WEIGHTS and array.size:
+            # eigvalsh reads one triangle alone.
+            flawed = np.abs(array - array.swapaxes(-1, -2)).max() > 1e-9 * np.abs(array).max()
+            least, needed = np.linalg.eigvalsh(array).min(), -1e-9 * np.abs(array).max()
+            if flawed or (least <= 0 if name == "R" else least < needed):
+                kind = "positive definite" if name == "R" else "positive semidefinite"
+                raise UsageError(f"LtvProblem: {name} is not symmetric and {kind}; choose weights that are")
+        object.__setattr__(self, name, array)
+
+    def replaced(self, changes: dict[str, Any]) -> LtvProblem:
+        """This problem with other data of the same shapes; only these are checked again."""
+        unknown = changes.keys() - _SHAPES.keys()
+        if unknown:
+            raise UsageError(f"LtvProblem has no array {sorted(unknown)[0]!r}; arrays are {', '.join(_SHAPES)}")
+        (N, n, m), (c, e) = self.B.shape, (self.Cx.shape[1], len(self.C_end))
+        sizes = {"N": N, "M": N + 1, "n": n, "m": m, "c": c, "e": e}
+        made = copy(self)
+        for name, value in changes.items():
+            made._set(name, value, sizes)
+        return made
+
+    def disturbance(self, k: int, x: Array, u: Array, after: Array) -> Array:
+        """w_k = x_{k+1} − A_k x_k − B_k u_k − d_k, from what was measured."""
+        found: Array = after - self.A[k] @ x - self.B[k] @ u - self.d[k]
+        return found
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class SlsPlan:
+    """Inputs and responses to disturbances that keep all rows, whatever the disturbances in their boxes.
+
+    u_k = ū_k + Σ_{j<k} Φu_{k,j} w_j, and so x_k = x̄_k + Σ_{j<k} Φx_{k,j} w_j. `x` (N + 1, n) and `u` (N, m) are x̄ and ū;
+    `state_response` (N + 1, N, n, n) and `input_response` (N, N, m, n) have Φ_{k,j} at [k, j], and zeros for j ≥ k.
+    `tightening` (N, c) and `tightening_end` (e) are Σ_j Σ_i |row Φ_{k,j} e_i| r_{j,i}; with them, rows hold with `slack` ≥ 0
+    at least, rounding counted outwards. `cost` is that of the nominal trajectory, `objective` what was minimised;
+    `iterations` are of the interior-point method.
+    """
+
+    x: Array
+    u: Array
+    state_response: Array
+    input_response: Array
+    tightening: Array
+    tightening_end: Array
+    cost: float
+    objective: float
+    slack: float
+    iterations: int
+
+    def input(self, k: int, past: Array) -> Array:
+        """u_k, after the disturbances `past` (k, n) = w_0 … w_{k−1}."""
+        past = np.asarray(past, float).reshape(-1, self.x.shape[1])
+        if not 0 <= k < len(self.u) or len(past) != k:
+            raise UsageError(f"SlsPlan.input: stage {k} of {len(self.u)} with {len(past)} disturbances; it needs {k} of them")
+        u: Array = self.u[k] + np.einsum("jmi,ji->m", self.input_response[k, :k], past)
+        return u
+
+
+@final
+@dataclass(frozen=True)
+class SlsRefusal:
+    """No plan.
+
+    `infeasible`: multipliers show, up to rounding, that every plan costs more than `bound`, beyond all measure. `unsolved`: no
+    plan was found that could be verified.
+    """
+
+    kind: Literal["infeasible", "unsolved"]
+    reason: str
+    bound: float
+
+
+class Condensed(NamedTuple):
+    """Under u = K x + W v with the gains of the Riccati recursion, W Wᵀ = (R + BᵀPB)⁻¹, the cost is ½|v|² + linear + constant.
+
+    `P` (N + 1, n, n) are its matrices; `states` (N + 1, n, z) and `inputs` (N, m, z) respond to z = v₀ … v_{N−1}, x₀,
+    w₀ … w_{N−1}, and so do all rows (rows, z), those of stages first.
+    """
+
+    P: Array
+    states: Array
+    inputs: Array
+    rows: Array
+
+    @classmethod
+    def of(cls, p: LtvProblem) -> Condensed:
+        """Raises numpy.linalg.LinAlgError where R + BᵀPB is numerically singular."""
+        A, B, (N, n, m) = p.A, p.B, p.B.shape
+        K, W, P = np.zeros((N, m, n)), np.zeros((N, m, m)), np.zeros((N + 1, n, n))
+        P[N] = p.Q_end
+        for k in range(N - 1, -1, -1):
+            PB = P[k + 1] @ B[k]
+            root = np.linalg.inv(np.linalg.cholesky(p.R[k] + B[k].T @ PB))
+            G = root @ (PB.T @ A[k])
+            W[k], K[k] = root.T, -root.T @ G
+            V = p.Q[k] + A[k].T @ P[k + 1] @ A[k] - G.T @ G
+            P[k] = 0.5 * (V + V.T)
+        X, U = np.zeros((N + 1, n, N * (m + n) + n)), np.zeros((N, m, N * (m + n) + n))
+        closed, driven = A + B @ K, B @ W
+        X[0, :, N * m : N * m + n] = np.eye(n)
+        for k in range(N):
+            np.matmul(closed[k], X[k], out=X[k + 1])
+            X[k + 1, :, k * m : (k + 1) * m] = driven[k]
+            X[k + 1, :, N * m + (k + 1) * n : N * m + (k + 2) * n] = np.eye(n)
+        np.matmul(K, X[:N], out=U)
+        for k in range(N):
+            U[k, :, k * m : (k + 1) * m] = W[k]
+        before = np.concatenate([np.zeros_like(U[:1]), U[:-1]])
+        staged = p.Cx @ X[:N] + p.Cu @ U + p.Cp @ before
+        return cls(P, X, U, np.concatenate([staged.reshape(-1, X.shape[2]), p.C_end @ X[N]]))
+
+    def tracking(self, p: LtvProblem) -> tuple[Array, Array]:
+        """(x, u) of least cost without rows."""
+        N, _, m = p.B.shape
+        z = np.concatenate([np.zeros(N * m), p.x0, p.d.ravel()])
+        dx, du = self.states @ z - p.x_ref, self.inputs @ z - p.u_ref
+        weighted = np.einsum("kij,kj->ki", p.Q, dx[:N]), np.einsum("kij,kj->ki", p.R, du), p.Q_end @ dx[N]
+        z[: N * m] = -np.einsum("kiz,ki->z", self.states[:N, :, : N * m], weighted[0])
+        z[: N * m] -= np.einsum("kiz,ki->z", self.inputs[:, :, : N * m], weighted[1])
+        z[: N * m] -= self.states[N, :, : N * m].T @ weighted[2]
+        return self.states @ z, self.inputs @ z
 
 
 class _Rows(NamedTuple):
@@ -47,9 +257,7 @@ class SlsSolver:
     def __init__(self, problem: LtvProblem) -> None:
         self.problem = problem
         self._stale = True
-        self.working: npt.NDArray[np.bool_] = np.zeros(
-            (2, problem.Cx.shape[0] * problem.Cx.shape[1] + len(problem.C_end)), np.bool_
-        )
+        self.working: Bools = np.zeros((2, problem.Cx.shape[0] * problem.Cx.shape[1] + len(problem.C_end)), np.bool_)
 
     def update(self, **changes: Any) -> None:
         """Other data of the same shapes: x0, A, B, d, r, references, limits, …"""
@@ -81,7 +289,10 @@ class SlsSolver:
             working = working | broken
         if status != kernels.SOLVED:
             self.forget()
-            return self._refusal(status, bound)
+            if status == kernels.INFEASIBLE:
+                return SlsRefusal("infeasible", f"rows cannot all hold: every plan costs more than {bound:.3g}", float(bound))
+            why = f"the interior-point method did not converge; plans cost at least {bound:.3g}"
+            return SlsRefusal("unsolved", why, float(bound))
         self.working = working & (multipliers > 1e-6 * multipliers.max(initial=0.0))
         return self._plan(rows, v, V / radii[columns][:, None], columns, count)
 
@@ -122,7 +333,7 @@ class SlsSolver:
         stages = np.einsum("ki,kij,kj->", dx[:N], p.Q, dx[:N]) + np.einsum("ki,kij,kj->", du, p.R, du)
         return 0.5 * float(stages + dx[N] @ p.Q_end @ dx[N])
 
-    def _restricted(self, rows: _Rows, working: npt.NDArray[np.bool_]) -> tuple[int, Array, Array, Array, int, float]:
+    def _restricted(self, rows: _Rows, working: Bools) -> tuple[int, Array, Array, Array, int, float]:
         """With the rows `working` (2, rows) alone: status, v̄, v_c, multipliers, iterations and a bound of the cost added."""
         (N, _, m), rho = self.problem.B.shape, self.problem.response_weight
         chosen = np.flatnonzero(working.any(axis=0))
@@ -156,12 +367,6 @@ class SlsSolver:
         multipliers[side, chosen[row]] = lam
         return status, -(eta @ own), V, multipliers, steps, bound
 
-    def _refusal(self, status: int, bound: float) -> SlsRefusal:
-        bound = float(bound)
-        if status == kernels.INFEASIBLE:
-            return SlsRefusal("infeasible", f"rows cannot all hold: every plan costs more than {bound:.3g}", bound)
-        return SlsRefusal("unsolved", f"the interior-point method did not converge; plans cost at least {bound:.3g}", bound)
-
     def _plan(self, rows: _Rows, v: Array, V: Array, columns: Ints, count: int) -> SlsPlan | SlsRefusal:
         """Its trajectories follow from its inputs, and it is one only where all rows hold on them."""
         p = self.problem
@@ -191,3 +396,45 @@ class SlsSolver:
             slack=slack,
             iterations=count,
         )
+
+
+def limits_of(p: LtvProblem) -> Array:
+    """(2, rows): sign a + τ ≤ limit for the signs + and −."""
+    return np.array([np.concatenate([p.h.ravel(), p.h_end]), np.concatenate([-p.low.ravel(), -p.low_end])])
+
+
+def verified(p: LtvProblem, inputs: Array) -> tuple[Array, Array, float]:
+    """States under `inputs` (N, m, 1 + N n) by the recursion itself, tightenings of all rows, and the least slack of a row.
+
+    Columns are the nominal one, then responses to each w_j: Z_{k+1} = A_k Z_k + B_k inputs_k + what enters at k. A bound of all
+    rounding errors is taken off the slack: with δ = (n + m + 4) ε, |error_{k+1}| ≤ |A_k| (|error_k| + δ |Z_k|) + δ (|B_k|
+    |inputs_k| + |d_k|), and likewise for rows and their sums.
+    """
+    N, n, m = p.B.shape
+    eps = float(np.finfo(float).eps)
+    Z, error = np.zeros((N + 1, n, 1 + N * n)), np.zeros((N + 1, n, 1 + N * n))
+    Z[0, :, 0] = p.x0
+    driven = p.B @ inputs
+    driven[:, :, 0] += p.d
+    size = np.abs(p.B) @ np.abs(inputs)
+    size[:, :, 0] += np.abs(p.d)
+    for k in range(N):
+        np.matmul(p.A[k], Z[k], out=Z[k + 1])
+        Z[k + 1] += driven[k]
+        Z[k + 1, :, 1 + k * n : 1 + (k + 1) * n] += np.eye(n)
+        A = np.abs(p.A[k])
+        error[k + 1] = A @ (error[k] + (n + m + 4) * eps * np.abs(Z[k])) + (n + m + 4) * eps * size[k]
+    before = np.concatenate([np.zeros_like(inputs[:1]), inputs[:-1]])
+    before[0, :, 0] = p.u_before
+    rows = (p.Cx @ Z[:N] + p.Cu @ inputs + p.Cp @ before).reshape(-1, 1 + N * n)
+    rows = np.concatenate([rows, p.C_end @ Z[N]])
+    weights, rounding = np.concatenate([[1.0], p.r.ravel()]), (N * n + n + 2 * m + 8) * eps
+    doubt = error + rounding * np.abs(Z)
+    lost = np.abs(p.Cx) @ (doubt[:N] @ weights)[:, :, None]
+    lost += rounding * (np.abs(p.Cu) @ np.abs(inputs) + np.abs(p.Cp) @ np.abs(before)) @ weights[:, None]
+    outward = np.concatenate([lost.ravel(), np.abs(p.C_end) @ (doubt[N] @ weights)])
+    a, tau = rows[:, 0], np.abs(rows[:, 1:]) @ weights[1:]
+    outward += rounding * (np.abs(a) + tau)
+    limits = limits_of(p)
+    slack = limits - np.array([a, -a]) - tau - outward
+    return Z, tau, float(slack[np.isfinite(limits)].min(initial=np.inf))

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from gapcert import Array
-from gapcert.plugin import Ints, compiler
+from gapcert.plugin import Array, Ints, compiler
 
 COMPILED = importlib.util.find_spec("numba") is not None
 SOLVED, INFEASIBLE, STALLED = 0, 1, 2

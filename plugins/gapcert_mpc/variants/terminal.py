@@ -6,8 +6,9 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from pathlib import Path
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 
@@ -16,13 +17,12 @@ from gapcert.plugin import Bools, Ints, Policy, Synthesizer, of_config
 from gapcert_cells import GridController, write_saved
 from gapcert_mpc.config import Terminal
 from gapcert_mpc.controller import MpcController, loaded
-from gapcert_mpc.inscribed import inscribed
 from gapcert_mpc.planning.design import Design, Ends
 from gapcert_mpc.planning.plans import Held, Plan
 from gapcert_mpc.planning.successive import steady
-from gapcert_mpc.program.features import featured, passing
 from gapcert_mpc.program.linearise import Frame, Stages
 from gapcert_mpc.program.program import Weights
+from gapcert_mpc.program.tube import passing
 from gapcert_mpc.task import Task
 from gapcert_mpc.thresholds import THRESHOLDS
 
@@ -64,6 +64,83 @@ class Ending:
         if not isinstance(made, GridController):
             raise UsageError(f"controller.terminal: {made.kind} makes no controller on cells; use symbolic")
         return made
+
+
+@final
+class Box(NamedTuple):
+    """Cells first ≤ i < after, per axis."""
+
+    first: Ints
+    after: Ints
+
+    @property
+    def slices(self) -> tuple[slice, ...]:
+        return tuple(slice(a, b) for a, b in zip(self.first.tolist(), self.after.tolist(), strict=True))
+
+
+@final
+class Sums:
+    """How many of the cells in a box are winning, by 2ⁿ sums of all cells before a corner."""
+
+    def __init__(self, winning: Bools) -> None:
+        self.sums = np.pad(winning.astype(np.int64), [(1, 0)] * winning.ndim)
+        for j in range(winning.ndim):
+            np.cumsum(self.sums, axis=j, out=self.sums)
+        self.corners = [((-1) ** (winning.ndim - sum(c)), c) for c in product((0, 1), repeat=winning.ndim)]
+
+    def whole(self, box: Box) -> bool:
+        """Are all of its cells winning?"""
+        ends = tuple(zip(box.first.tolist(), box.after.tolist(), strict=True))
+        count = sum(sign * int(self.sums[tuple(e[c] for e, c in zip(ends, at, strict=True))]) for sign, at in self.corners)
+        return bool(count == np.prod(box.after - box.first))
+
+
+def inscribed(winning: Bools, room: Ints, most: int) -> list[Box]:
+    """At most `most` boxes of winning cells, none part of a larger one, each with more than `room` cells per axis.
+
+    Each grows from a winning cell by layers, as thick ones as fit first, along all axes or along one of them first. Of these
+    the boxes are taken one by one that hold most cells no other holds, once half of `room` is left at each edge.
+    """
+    sums, rng = Sums(winning), np.random.default_rng(0)
+    cells = np.argwhere(winning)
+    if not len(cells):
+        return []
+    seeds = cells[np.unique(rng.integers(len(cells), size=THRESHOLDS.inscribed_seeds))]
+    orders = [None, *range(winning.ndim)] if winning.ndim > 1 else [None]
+    grown = {tuple(np.concatenate(_grown(sums, winning.shape, seed, j)).tolist()) for seed in seeds for j in orders}
+    n = winning.ndim
+    found = [Box(np.array(b[:n]), np.array(b[n:])) for b in sorted(grown)]
+    left = [b for b in found if (b.after - b.first > room).all()]
+    covered, out = np.zeros(winning.shape, dtype=bool), list[Box]()
+    while left and len(out) < most:
+        inner = [Box(b.first + room // 2, b.after - room // 2).slices for b in left]
+        gained = [int((~covered[at]).sum()) for at in inner]
+        best = int(np.argmax(gained))
+        if gained[best] == 0:
+            break
+        covered[inner[best]] = True
+        out.append(left.pop(best))
+    return out
+
+
+def _grown(sums: Sums, counts: tuple[int, ...], seed: Ints, lead: int | None) -> Box:
+    """From one cell: along axis `lead` as far as it goes, if one leads, then along all of them in turn."""
+    box = Box(seed.copy(), seed + 1)
+    for axes in ([lead], range(len(counts))) if lead is not None else (range(len(counts)),):
+        step = max(counts) // 4 + 1
+        while step:
+            moved = False
+            for j, up in product(axes, (False, True)):
+                first, after = box.first.copy(), box.after.copy()
+                if up:
+                    after[j] = min(after[j] + step, counts[j])
+                else:
+                    first[j] = max(first[j] - step, 0)
+                then = Box(first, after)
+                if (after - first).sum() > (box.after - box.first).sum() and sums.whole(then):
+                    box, moved = then, True
+            step = step if moved else step // 2
+    return box
 
 
 def states(then: GridController, first: Ints, after: Ints) -> Array:
@@ -259,13 +336,13 @@ def handed(task: Task) -> Controller:
     then = terminal.controller(problem)
     if not then.wins:
         return task.nothing(f"the winning set in which plans would end is empty: {then.evidence['reason']}")
-    stages, F = featured(task.nominal, task.zone, horizon, frame, options.majorant != "affine")
+    stages, F = task.nominal.featured(task.zone, horizon, frame, options.majorant != "affine")
     if (reason := task.unbounded(stages) or task.unstable(stages)) is not None:
         return task.nothing(reason)
     weights, reference = task.weights(stages), steady(task.nominal, frame, *task.wanted())[0]
     made, half = _planning(task, stages, F, weights, reference)
     if options.majorant == "auto" and not (half < THRESHOLDS.small_tube).all():
-        made, half = _planning(task, *featured(task.nominal, task.zone, horizon, frame, False), weights, reference)
+        made, half = _planning(task, *task.nominal.featured(task.zone, horizon, frame, False), weights, reference)
     assert made.ends is not None
     boxes = ends(then, frame, 2 * (half[:nx] + tolerance), reference[:nx], terminal.boxes)
     if not len(boxes):
@@ -274,7 +351,7 @@ def handed(task: Task) -> Controller:
         return task.nothing(reason)
     design = replace(made, ends=replace(made.ends, boxes=boxes))
     plans = MpcController(problem.goal, design, {}, "piqp" if options.solver == "auto" else options.solver)
-    x = task.drawn(np.random.default_rng(problem.seed), options.starts)
+    x = task.drawn(np.random.default_rng(problem.seed), task.starts)
     found = HandedController(plans, then, {}, terminal.policy)
     evidence = {
         "horizon": horizon,
@@ -296,4 +373,4 @@ def _planning(task: Task, stages: Stages, F: Array, weights: Weights, reference:
     frame, section = task.frame, passing(stages, F, task.whole)
     lacking = Ends(np.zeros((0, 2, frame.nx)), F)
     made = Design(frame, stages, section, task.rows, weights, reference, task.options.tolerance, ends=lacking)
-    return made, np.asarray(section.support @ made.program().tube(np.zeros((stages.horizon + 1, len(F))))[-1])
+    return made, np.asarray(section.support @ made.program().tube()[-1])
