@@ -13,8 +13,8 @@ import numpy as np
 
 from gapcert import Array, Controller, Goal, Interval, SynthesisProblem
 from gapcert.plugin import Bools, Ints, Policy
-from gapcert_cells import write_saved
-from gapcert_mpc.controller import MpcController, loaded
+from gapcert_cells import loaded, write_saved
+from gapcert_mpc.controller import MpcController
 from gapcert_mpc.planning.plans import Memory
 from gapcert_mpc.program.linearise import Nominal
 from gapcert_mpc.saved_models import known, pair

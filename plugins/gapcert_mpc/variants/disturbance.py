@@ -15,8 +15,8 @@ import scipy.linalg
 
 from gapcert import Array, Controller, Goal, UsageError
 from gapcert.plugin import Bools
-from gapcert_cells import write_saved
-from gapcert_mpc.controller import MpcController, PlanController, loaded
+from gapcert_cells import loaded, write_saved
+from gapcert_mpc.controller import MpcController, PlanController
 from gapcert_mpc.planning.design import Design
 from gapcert_mpc.planning.plans import Memory
 from gapcert_mpc.task import Task
