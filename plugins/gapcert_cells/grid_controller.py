@@ -78,10 +78,6 @@ class GridController(Controller):
         return tuple(len(e) - 1 for e in self.edges)
 
     @property
-    def low(self) -> Array:
-        return np.asarray(self.goal.stay.low)
-
-    @property
     def widths(self) -> Array:
         return np.asarray([(e[-1] - e[0]) / (len(e) - 1) for e in self.edges])
 
