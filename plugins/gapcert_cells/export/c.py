@@ -265,11 +265,7 @@ def write_c(controller: Exported, out: Path) -> list[Path]:
     numbers = len(one.values) * (2 * (len(parts) + memory) + (one.splits is not None)) + sets.size
     if numbers > LARGEST:
         raise UsageError(f"export: C tables of {numbers:,} numbers (limit {LARGEST:,}); use --to numpy, or fewer cells")
-    words = {
-        "given": "int memory, " if memory else "",
-        "passed": "memory, " if memory else "",
-        "moved": MOVED if memory else "",
-    }
+    words = {"given": "int memory, ", "passed": "memory, ", "moved": MOVED} if memory else dict.fromkeys(WORDS, "")
     counts = {"nx": len(stay.axes), "nu": one.points.shape[1], "points": len(one.points), "cells": cells_of(controller)}
     # Names of a stranger's controller stand in a comment, which they must not end.
     told = ", ".join(f"{a.name} [{a.unit or '1'}]" for a in stay.axes).replace("*/", "* /").replace("/*", "/ *")
