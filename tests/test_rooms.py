@@ -31,11 +31,11 @@ def test_packages_name_others_by_what_they_offer():
 def test_a_name_from_inside_another_package_is_caught(tmp_path):
     (tmp_path / "a.py").write_text(
         "from gapcert import Domain\nfrom gapcert.plugin import Zone\nfrom gapcert_cells import Splits\n"
-        "def f():\n    from gapcert.spec.spec import load_spec\n    from gapcert_cells.cell_tree import Splits\n"
+        "def f():\n    from gapcert.spec.spec import load_spec\n    from gapcert_cells.successors import Splits\n"
     )
     assert rooms.inner({**rooms.files(), "gapcert_dask.a": tmp_path / "a.py"}) == [
         ("gapcert_dask.a", "gapcert.spec.spec"),
-        ("gapcert_dask.a", "gapcert_cells.cell_tree"),
+        ("gapcert_dask.a", "gapcert_cells.successors"),
     ]
 
 

@@ -13,8 +13,7 @@ import numpy.typing as npt
 
 from gapcert.plugin import ANYWHERE, Array, Automaton, Bools, Box, Controller, Goal, Ints, Policy, UsageError
 
-from .cell_tree import stored
-from .files import loading, write_saved
+from .files import loaded, write_saved
 from .grid_controller import GridController
 
 
@@ -127,14 +126,6 @@ class AutomatonController(Controller):
         x = replace(self.parts[0], values=best).draw(n, rng)
         return x[self.contains(x)]
 
-    def _arrays(self) -> dict[str, npt.NDArray[Any]]:
-        edges = {f"edges{j}": e for j, e in enumerate(self.parts[0].edges)}
-        stacks = {name: np.stack([getattr(part, name) for part in self.parts]) for name in ("bits", "values")}
-        promised = {} if (made := self.parts[0].successors) is None else made.arrays()
-        if (splits := self.parts[0].splits) is not None:
-            promised |= {"splits": splits.first, "halvings": np.array(splits.levels)}
-        return edges | promised | stacks | {"points": self.parts[0].points, "must": self.must, "may": self.may}
-
     def digest(self) -> str:
         """SHA-256 of everything that determines the inputs."""
         out = hashlib.sha256("".join(part.digest() for part in self.parts).encode())
@@ -143,26 +134,20 @@ class AutomatonController(Controller):
 
     def save(self, folder: Path | str) -> None:
         """Write `controller.npz` and `controller.json` into `folder`; `load` needs nothing but this module."""
-        data = {"format": 1, "kind": self.kind, "goal": self.goal.to_data(), "evidence": dict(self.evidence)}
-        data |= {"held": held} if (held := self.parts[0].held_data()) else {}
-        write_saved(Path(folder), data | {"digest": self.digest()}, self._arrays())
+        stacks = {name: np.stack([getattr(part, name) for part in self.parts]) for name in ("bits", "values")}
+        own = {"kind": self.kind, "evidence": dict(self.evidence), "digest": self.digest()}
+        write_saved(folder, self.parts[0].told() | own, self.parts[0].arrays() | stacks | {"must": self.must, "may": self.may})
 
     @classmethod
     def load(cls, folder: Path | str) -> AutomatonController:
         """Inverse of `save`; UsageError where the files are absent, damaged or do not belong together."""
-        with loading(Path(folder)) as (data, arrays):
-            goal = Goal.from_data(data["goal"])
-            if goal.automaton is None:
+
+        def made(data: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> AutomatonController:
+            whole = GridController.read(data, arrays)
+            if whole.goal.automaton is None:
                 raise UsageError(f"{folder}: the saved controller has no memory; load it with GridController.load")
-            held = Box.among(goal.stay.axes, data.get("held", {}))
-            edges = tuple(arrays[f"edges{j}"] for j in range(len(goal.stay.axes) - len(data.get("held", {}))))
-            none = GridController(goal, edges, arrays["points"], arrays["bits"][0], arrays["values"][0], {}, held=held)
-            own = {"evidence": {}, "kind": data["kind"], "held": held, **stored(none.counts, none.wraps, arrays)}
-            parts = tuple(
-                GridController(goal, edges, arrays["points"], bits, values, **own)
-                for bits, values in zip(arrays["bits"], arrays["values"], strict=True)
-            )
-            controller = cls(goal, parts, arrays["must"], arrays["may"], data["evidence"], data["kind"])
-        if controller.digest() != data.get("digest"):
-            raise UsageError(f"{folder}: controller.npz and controller.json do not belong together; synthesize it again")
-        return controller
+            each = zip(arrays["bits"], arrays["values"], strict=True)
+            parts = tuple(replace(whole, bits=bits, values=values, evidence={}) for bits, values in each)
+            return cls(whole.goal, parts, arrays["must"], arrays["may"], data["evidence"], data["kind"])
+
+        return loaded(folder, made)

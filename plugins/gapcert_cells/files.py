@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from gapcert.plugin import DAMAGE, UsageError, clipped, npz_bytes, write_atomic
+
+C = TypeVar("C", bound=Any)
 
 
 def write_saved(folder: Path | str, data: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> None:
@@ -42,6 +44,19 @@ def loading(folder: Path | str) -> Iterator[tuple[dict[str, Any], Any]]:
         data = saved_data(folder)
         with (folder / "controller.npz").open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             yield data, arrays
+
+
+def loaded(
+    folder: Path | str,
+    made: Callable[[dict[str, Any], dict[str, npt.NDArray[Any]]], C],
+    files: str = "controller.npz and controller.json",
+) -> C:
+    """What is made of the data and arrays in a folder; UsageError where they are absent, damaged, or not of one controller."""
+    with loading(folder) as (data, arrays):
+        found = made(data, {name: arrays[name] for name in arrays.files})
+    if found.digest() != data.get("digest"):
+        raise UsageError(f"{Path(folder)}: {files} do not belong together; synthesize it again")
+    return found
 
 
 @contextmanager

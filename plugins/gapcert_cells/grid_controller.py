@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import Any, final
 
@@ -29,10 +30,8 @@ from gapcert.plugin import (
     turned,
 )
 
-from .cell_tree import Splits, SuccessorsByLevel, stored
-from .files import loading, write_saved
-from .input_choice import by_order, efforts
-from .successors import Successors, depths, nearest_to_the_edge
+from .files import loaded, write_saved
+from .successors import Splits, Successors, SuccessorsByLevel
 
 Promised = Successors | SuccessorsByLevel
 
@@ -77,10 +76,6 @@ class GridController(Controller):
     @property
     def counts(self) -> tuple[int, ...]:
         return tuple(len(e) - 1 for e in self.edges)
-
-    @property
-    def low(self) -> Array:
-        return np.asarray(self.goal.stay.low)
 
     @property
     def widths(self) -> Array:
@@ -197,13 +192,22 @@ class GridController(Controller):
         return out
 
     def _adversarial(self, cell: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """(n,): of the allowed inputs of each cell the one with the greatest height at any corner of its successors.
+
+        Ties go to the greatest mean over the corners, then to the first.
+        """
         if self.successors is None or "adversarial" not in self.policies:
             raise UsageError(
                 "controller: policy 'adversarial' needs the promised successors, which were too many to be kept; use fewer "
                 "cells or inputs, or another policy"
             )
         fresh = np.unique(cell[self._worst[cell] < 0])
-        self._worst[fresh] = nearest_to_the_edge(self.successors.corners, fresh, self.allowed(fresh), self._height)
+        row, which = np.nonzero(allowed := self.allowed(fresh))
+        heights = self._height[corners(*self.successors.ends(fresh[row], which), self.counts, self.wraps)]
+        top, score = heights.max(axis=1), np.full(allowed.shape, -np.inf)
+        # The mean lies below the top by less than the range, so that it decides between equals only.
+        score[row, which] = top + (heights.mean(axis=1) - top) / (1.0 + float(np.ptp(self._height)))
+        self._worst[fresh] = score.argmax(axis=1)
         return self._worst[cell].astype(np.int64)
 
     @cached_property
@@ -213,6 +217,7 @@ class GridController(Controller):
 
     @cached_property
     def _height(self) -> Array:
+        """(places,): whole numbers, the greater the nearer to losing."""
         values = self._painted(self.values)
         height = values.astype(np.float64)
         if self.goal.kind in ("invariance", "reach_and_stay"):
@@ -275,46 +280,109 @@ class GridController(Controller):
         whole[:, self._others] = start + (np.asarray(self.held.high) - start) * rng.random((n, len(start)))
         return whole
 
-    def _arrays(self) -> dict[str, npt.NDArray[Any]]:
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """What `controller.npz` holds."""
         edges: dict[str, npt.NDArray[Any]] = {f"edges{j}": e for j, e in enumerate(self.edges)}
         promised = {} if self.successors is None else self.successors.arrays()
         promised |= {} if self.splits is None else {"splits": self.splits.first, "halvings": np.array(self.splits.levels)}
         promised |= {} if self.lasting == (0,) else {"lasting": np.array(self.lasting)}
         return edges | {"points": self.points, "bits": self.bits, "values": self.values} | promised
 
+    def told(self) -> dict[str, Any]:
+        """What `controller.json` says, but for the digest."""
+        data = {"format": 1, "kind": self.kind, "goal": self.goal.to_data(), "evidence": dict(self.evidence)}
+        return data | ({"held": held} if (held := self._held_data()) else {})
+
     def digest(self) -> str:
         """SHA-256 of everything that determines the inputs."""
-        held = self.held_data()
+        held = self._held_data()
         out = hashlib.sha256(json.dumps([self.kind, self.goal.to_data(), *([held] if held else [])]).encode())
-        for name, array in self._arrays().items():
+        for name, array in self.arrays().items():
             out.update(f"{name}{array.dtype.str}{array.shape}".encode() + np.ascontiguousarray(array).tobytes())
         return out.hexdigest()
 
-    def held_data(self) -> dict[str, list[float]]:
+    def _held_data(self) -> dict[str, list[float]]:
         """The bounds of `held`, by name."""
         box = self.held
         return {} if box is None else {n: [a, b] for n, a, b in zip(box.names, box.low, box.high, strict=True)}
 
     def save(self, folder: Path | str) -> None:
         """Write `controller.npz` and `controller.json` into `folder`; `load` needs nothing but this module."""
-        folder = Path(folder)
-        data = {"format": 1, "kind": self.kind, "goal": self.goal.to_data(), "evidence": dict(self.evidence)}
-        data |= {"held": held} if (held := self.held_data()) else {}
-        write_saved(folder, data | {"digest": self.digest()}, self._arrays())
+        write_saved(folder, self.told() | {"digest": self.digest()}, self.arrays())
 
     @classmethod
     def load(cls, folder: Path | str) -> GridController:
         """Inverse of `save`; UsageError where the files are absent, damaged or do not belong together."""
-        with loading(Path(folder)) as (data, arrays):
-            goal, held = Goal.from_data(data["goal"]), data.get("held", {})
-            if goal.automaton is not None:
+
+        def made(data: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> GridController:
+            if "automaton" in data["goal"]:
                 raise UsageError(f"{folder}: the saved controller has a memory; load it with AutomatonController.load")
-            edges = tuple(arrays[f"edges{j}"] for j in range(len(goal.stay.axes) - len(held)))
-            points, bits, values = arrays["points"], arrays["bits"], arrays["values"]
-            box = Box.among(goal.stay.axes, held)
-            lasting = tuple(arrays["lasting"].tolist()) if "lasting" in arrays.files else (0,)
-            controller = cls(goal, edges, points, bits, values, data["evidence"], data["kind"], box, lasting=lasting)
-            controller = replace(controller, **stored(controller.counts, controller.wraps, arrays))
-        if controller.digest() != data.get("digest"):
-            raise UsageError(f"{folder}: controller.npz and controller.json do not belong together; synthesize it again")
-        return controller
+            return cls.read(data, arrays)
+
+        return loaded(folder, made)
+
+    @classmethod
+    def read(cls, data: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> GridController:
+        """Inverse of `told` and `arrays`."""
+        goal, held = Goal.from_data(data["goal"]), data.get("held", {})
+        edges = tuple(arrays[f"edges{j}"] for j in range(len(goal.stay.axes) - len(held)))
+        points, bits, values = arrays["points"], arrays["bits"], arrays["values"]
+        box = Box.among(goal.stay.axes, held)
+        lasting = tuple(arrays["lasting"].tolist()) if "lasting" in arrays else (0,)
+        controller = cls(goal, edges, points, bits, values, data["evidence"], data["kind"], box, lasting=lasting)
+        counts, wraps = controller.counts, controller.wraps
+        if "halvings" not in arrays:
+            return replace(controller, promised=Successors.from_arrays(counts, wraps, arrays))
+        halvings = int(arrays["halvings"])
+        splits = Splits(tuple(n >> halvings for n in counts), halvings, arrays["splits"])
+        return replace(controller, splits=splits, promised=SuccessorsByLevel.from_arrays(splits, wraps, arrays))
+
+
+def by_order(
+    policy: Policy, allowed: npt.NDArray[np.uint8], number: npt.NDArray[np.int64], seed: int, k: int
+) -> npt.NDArray[np.int64]:
+    """Which input each row takes, under a policy that only counts: allowed (n, m), number (n,) of them."""
+    if policy == "first":
+        rank = np.zeros_like(number)
+    elif policy == "last":
+        rank = number - 1
+    elif policy == "middle":
+        rank = number // 2
+    else:
+        share = np.random.Generator(np.random.Philox(np.random.SeedSequence([seed, k]))).random(len(number))
+        rank = np.minimum((share * number).astype(np.int64), number - 1)
+    return np.asarray((np.cumsum(allowed, axis=1) > rank[:, None]).argmax(axis=1))
+
+
+def efforts(points: Array) -> Array:
+    """(m,): ‖u / s‖₂ of each input, s the range of each component; 1 where it does not vary."""
+    span = np.ptp(points, axis=0)
+    return np.asarray(np.sqrt(((points / np.where(span > 0, span, 1.0)) ** 2).sum(axis=1)))
+
+
+def depths(winning: Bools, wraps: tuple[bool, ...]) -> npt.NDArray[np.int32]:
+    """(cells,): how many cells away, along the axis where it is farthest, the nearest cell is that does not win; 0 for those.
+
+    Beyond the grid nothing wins.
+    """
+    from scipy.ndimage import distance_transform_cdt
+
+    field = winning
+    for k, (n, round_) in enumerate(zip(winning.shape, wraps, strict=True)):
+        widths = [(0, 0)] * winning.ndim
+        widths[k] = (n, n) if round_ else (1, 1)
+        field = np.pad(field, widths, mode="wrap" if round_ else "constant")
+    if field.all():
+        return np.full(winning.size, max(winning.shape), dtype=np.int32)
+    found = distance_transform_cdt(field, metric="chessboard")
+    inner = tuple(slice(n, 2 * n) if w else slice(1, n + 1) for n, w in zip(winning.shape, wraps, strict=True))
+    return np.asarray(found[inner], dtype=np.int32).ravel()
+
+
+def corners(first: Ints, last: Ints, counts: tuple[int, ...], wraps: tuple[bool, ...]) -> Ints:
+    """(n, 2^axes): flat cells at the corners of boxes, from first to last (n, axes); those outside moved to the grid's edge."""
+    ends = np.stack([first, last])
+    for k, (n, round_) in enumerate(zip(counts, wraps, strict=True)):
+        ends[:, :, k] = ends[:, :, k] % n if round_ else np.clip(ends[:, :, k], 0, n - 1)
+    sides = product((0, 1), repeat=len(counts))
+    return np.stack([np.ravel_multi_index([ends[s, :, k] for k, s in enumerate(side)], counts) for side in sides], axis=1)

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NoReturn, final
 
-from gapcert.plugin import MOST, Automaton, UsageError
+import numpy as np
+
+from gapcert.plugin import MOST, Automaton, Bools, Ints, UsageError
 
 _TOKEN = re.compile(
     r'\s*(?:(?P<text>"(?:\\.|[^"\\])*")|(?P<mark>--[A-Z]+--)|(?P<header>[A-Za-z_][\w-]*:)|(?P<number>\d+)'
     r"|(?P<name>@?[A-Za-z_][\w-]*)|(?P<sign>[\[\](){}!&|]))"
 )
-Label = Callable[[int], bool]
 IGNORED = ("tool:", "name:", "properties:", "acc-name:")  # none of them changes what is accepted
-
-
 NUMBER, LONGEST = re.compile("[0-9]{1,9}"), 300_000
 
 
@@ -62,44 +60,44 @@ class _Reader:
             values.append(self.take())
         return values
 
-    def label(self, propositions: int) -> Label:
+    def label(self, propositions: int) -> Bools:
+        """(letters,): those that it holds of."""
+        letters = np.arange(1 << propositions)
         self.take("[")
-        made = self._or(propositions)
+        made = self._or(letters)
         self.take("]")
         return made
 
-    def _or(self, n: int) -> Label:
-        parts = [self._and(n)]
+    def _or(self, letters: Ints) -> Bools:
+        found = self._and(letters)
         while self.next == "|":
             self.take()
-            parts.append(self._and(n))
-        return lambda letter: any(p(letter) for p in parts)
+            found = found | self._and(letters)
+        return found
 
-    def _and(self, n: int) -> Label:
-        parts = [self._atom(n)]
+    def _and(self, letters: Ints) -> Bools:
+        found = self._atom(letters)
         while self.next == "&":
             self.take()
-            parts.append(self._atom(n))
-        return lambda letter: all(p(letter) for p in parts)
+            found = found & self._atom(letters)
+        return found
 
-    def _atom(self, n: int) -> Label:
+    def _atom(self, letters: Ints) -> Bools:
         if self.next == "!":
             self.take()
-            inner = self._atom(n)
-            return lambda letter: not inner(letter)
+            return ~self._atom(letters)
         if self.next == "(":
             self.take()
-            inner = self._or(n)
+            inner = self._or(letters)
             self.take(")")
             return inner
         if self.next in ("t", "f"):
-            value = self.take() == "t"
-            return lambda _: value
+            return np.full(len(letters), self.take() == "t")
         if self.next.startswith("@"):
             self.fail("aliases are not supported; write the labels out")
-        if (p := self.number()) >= n:
+        if (p := self.number()) >= (n := len(letters).bit_length() - 1):
             self.fail(f"a label names proposition {p}; AP: has {n}")
-        return lambda letter: bool(letter >> p & 1)
+        return np.asarray(letters >> p & 1 > 0)
 
     def marked(self) -> bool:
         """Is there an acceptance set?"""
@@ -125,7 +123,7 @@ def read_hoa(text: str, name: str = "automaton") -> Automaton:
 def _read(reader: _Reader, text: str) -> Automaton:
     reader.read(text)
     states, start, propositions, buchi = _header(reader)
-    edges: list[list[tuple[Label, int, bool]]] = [[] for _ in range(states)]
+    edges: list[list[tuple[Bools, int, bool]]] = [[] for _ in range(states)]
     accepting = [False] * states
     while reader.next == "State:":
         reader.take()
@@ -185,7 +183,7 @@ def _made(reader: _Reader, edges: Any, accepting: list[bool], start: int, propos
     for q, outgoing in enumerate(edges):
         row = []
         for letter in range(1 << len(propositions)):
-            found = {(target, marked) for label, target, marked in outgoing if label(letter)}
+            found = {(target, marked) for label, target, marked in outgoing if label[letter]}
             if len(found) > 1:
                 holds = [n for p, n in enumerate(propositions) if letter >> p & 1]
                 reader.fail(f"state {q} is not deterministic ({', '.join(holds) or 'nothing'} holds); determinise it first")

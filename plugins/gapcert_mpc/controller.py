@@ -14,7 +14,7 @@ from typing import Any, Generic, Protocol, TypeVar, final
 import numpy as np
 
 from gapcert.plugin import Array, Bools, Controller, Event, Goal, Ints, Policy, Pulse, UsageError
-from gapcert_cells import loading, write_saved
+from gapcert_cells import loaded, write_saved
 
 from .planning.arrival import Arrival
 from .planning.design import Design
@@ -40,7 +40,6 @@ class Remembered(Protocol):
 
 
 R = TypeVar("R", bound=Remembered)
-C = TypeVar("C", bound=Any)
 
 
 class PlanController(Controller, Generic[R]):
@@ -321,17 +320,6 @@ class MpcController(PlanController[Held]):
             told = known(data["kept"], arrays)
             nominal = Nominal(told["model"], told["gap"])
         return cls(Goal.from_data(data["goal"]), design, data["evidence"], data["solver"], nominal=nominal)
-
-
-def loaded(
-    folder: Path | str, made: Callable[[Any, dict[str, Array]], C], files: str = "controller.npz and controller.json"
-) -> C:
-    """What is made of the data and arrays in a folder; UsageError where they are absent, damaged, or not of one controller."""
-    with loading(Path(folder)) as (data, arrays):
-        found = made(data, {name: arrays[name] for name in arrays.files})
-    if found.digest() != data.get("digest"):
-        raise UsageError(f"{Path(folder)}: {files} do not belong together; synthesize it again")
-    return found
 
 
 def looked(controller: Controller, x: Array, emit: Callable[[Event], None]) -> Bools:

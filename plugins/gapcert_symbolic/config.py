@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, final
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from gapcert.plugin import Keyed
+from gapcert.plugin import Keyed, Policy
 
 if TYPE_CHECKING:
     from gapcert.plugin import Context, Model
@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 Cells = Annotated[int, Field(ge=1)]
 Inputs = Annotated[int, Field(ge=2)]
 Bound = float | str
-Policy = Literal["first", "middle", "last", "random", "least-effort", "adversarial"]
 
 
 @final

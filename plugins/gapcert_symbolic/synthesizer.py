@@ -2,45 +2,41 @@
 
 from __future__ import annotations
 
+import importlib.util
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, Literal, NamedTuple, final
 
 import numpy as np
 
-from gapcert import Array, Box, Domain, GapFunction, Goal, Model, Region, SynthesisProblem, UsageError
+from gapcert import Array, Box, Domain, GapFunction, Goal, MissingDependency, Model, Region, SynthesisProblem, UsageError
 from gapcert.plugin import Bools, Ints, Policy, Pulse, Synthesizer, magnitude
 from gapcert_cells import AutomatonController, GridController, Successors
 from gapcert_symbolic.thresholds import THRESHOLDS
 
 from .cells.abstraction import Windows, check_size, windows
-from .cells.bounds import Bound, Enclosed, Grown
+from .cells.bounds import Bound, Enclosed, Grown, inferred
 from .cells.gaps import Disturbance, disturbance
-from .cells.grid import Grid, corners, multiples, spaced
+from .cells.grid import Grid, combined, multiples, spaced
 from .cells.held import Left, invariant, offered
-from .cells.structure import inferred
-from .games.automata import Labels, product, started, unlabelled
-from .games.change import in_words, tried
-from .games.games import inside, over, reach_and_stay, recurrence, touching
-from .games.reason import Cause, why_empty
-from .games.refined_automata import refined_product
+from .games.automata import Labels, product, started
+from .games.games import reach_and_stay, recurrence, solve, usable
+from .games.reason import in_words, tried, why_empty
 from .games.refinement import Refined, refined
-from .solvers import dense
 from .solvers.problem import Dynamics, Problem, Solution
-from .solvers.solvers import solve, usable
 
 CHUNK = 1 << 20
 TRUSTED = "The successors of cells are bounded by the growth bound that is declared, in floating point; nothing proves it."
 SEEN = (
-    f"On which states and inputs the model's successors depend was inferred from {THRESHOLDS.structure_pairs} random "
-    "pairs of points per axis, as "
-    f"the model encloses no derivatives; a dependence that none of them shows is missed."
+    f"On which states and inputs the model's successors depend was inferred from {THRESHOLDS.structure_pairs} random pairs of "
+    "points per axis, as the model encloses no derivatives; a dependence that none of them shows is missed."
 )
 
 
 @final
+@dataclass(frozen=True, eq=False)
 class Symbolic(Synthesizer):
     """A cell wins under an input if f over the whole cell, plus [l, u] over the whole cell, lies in winning cells.
 
@@ -53,35 +49,30 @@ class Symbolic(Synthesizer):
     of `eta`, a distance per state and input, and the inputs at such multiples too. growth: a Model of radii, the growth bound
     ρ(r, u), taken on trust; default: the model's own enclosures, rounded outwards. error: with a growth bound, how far a state
     may be from where it was measured. solver: `jax` solves the same games on the device that JAX finds. threads:
-    how many the compiled solvers may use (see `solvers.usable`); what they find does not depend on it. refine: so many times
-    cells that lost, but may yet win, are halved along every axis (see `refinement`, `refined_automata`).
+    how many the compiled solvers may use (see `games.usable`); what they find does not depend on it. refine: so many times
+    cells that lost, but may yet win, are halved along every axis (see `refinement`).
     """
+
+    cells: Mapping[str, int] = field(default_factory=dict)
+    inputs: Mapping[str, int] = field(default_factory=dict)
+    policy: Policy = "first"
+    on: Sequence[str] | None = None
+    input_range: Mapping[str, tuple[float | str, float | str]] | None = None
+    align: Literal["tile", "scots"] = "tile"
+    eta: Mapping[str, float | str] | None = None
+    growth: Any = None
+    error: Mapping[str, float | str] | None = None
+    solver: Literal["compiled", "jax"] = "compiled"
+    threads: int | None = None
+    refine: int = 0
 
     name = "symbolic"
 
-    def __init__(
-        self,
-        cells: Mapping[str, int] | None = None,
-        inputs: Mapping[str, int] | None = None,
-        policy: Policy = "first",
-        on: Sequence[str] | None = None,
-        input_range: Mapping[str, tuple[float | str, float | str]] | None = None,
-        align: Literal["tile", "scots"] = "tile",
-        eta: Mapping[str, float | str] | None = None,
-        growth: Any = None,
-        error: Mapping[str, float | str] | None = None,
-        solver: Literal["compiled", "jax"] = "compiled",
-        threads: int | None = None,
-        refine: int = 0,
-    ) -> None:
-        self.cells, self.inputs, self.policy = dict(cells or {}), dict(inputs or {}), policy
-        self.on, self.input_range, self.align, self.eta, self.growth = on, input_range, align, dict(eta or {}), growth
-        self.error, self.solver, self.refine = dict(error or {}), solver, refine
-        self.threads = threads
-
     def check(self, model: Model, domain: Domain, goal: Goal) -> None:
-        if self.solver == "jax":
-            dense.check()
+        if self.solver == "jax" and importlib.util.find_spec("jax") is None:
+            raise MissingDependency(
+                "controller.solver: jax needs jax, which is not installed; run: pip install 'gapcert[jax]', or leave solver out"
+            )
         plan = self._plan(model, domain, goal, None)
         # A model that knows no range over boxes says so at the first cell.
         self._bound(model, plan.grid).over(*plan.grid.cells(0, 1), np.asarray([[a[0] for a in plan.axes]]))
@@ -92,9 +83,8 @@ class Symbolic(Synthesizer):
                 raise UsageError("controller.error: errors of measurement need a growth bound; add growth")
             return Enclosed(model)
         spare, names = grid.widths / 1e10, [s.name for s in model.states]
-        for name, value in self.error.items():
-            if name not in names:
-                raise UsageError(f"controller.error: '{name}' is no state; expected some of {', '.join(names)}")
+        _refuse_unknown("error", self.error or (), names, "no state; expected some of")
+        for name, value in (self.error or {}).items():
             j = names.index(name)
             spare[j] = magnitude(value, model.states[j].unit)
             if not 0 <= spare[j] < math.inf:
@@ -125,36 +115,28 @@ class Symbolic(Synthesizer):
             raise UsageError(
                 "controller: align: scots takes distances; give eta for every state and input, and no counts or on"
             )
-        eta = []
+        names, given, eta = (*goal.stay.names, *inputs.names), self.eta or {}, []
         for axis in (*goal.stay.axes, *inputs.axes):
-            if axis.name not in self.eta:
+            if axis.name not in given:
                 raise UsageError(
                     f"controller.eta: nothing for '{axis.name}'; add {axis.name}: a distance in {axis.unit or '1'}"
                 )
-            value = magnitude(self.eta[axis.name], axis.unit)
-            if not 0 < value < math.inf:
-                raise UsageError(f"controller.eta: {axis.name} is {value:g}; give a positive distance")
-            eta.append(value)
-        if unknown := [n for n in self.eta if n not in (*goal.stay.names, *inputs.names)]:
-            raise UsageError(
-                f"controller.eta: '{unknown[0]}' is unknown; expected {', '.join((*goal.stay.names, *inputs.names))}"
-            )
+            eta.append(magnitude(given[axis.name], axis.unit))
+            if not 0 < eta[-1] < math.inf:
+                raise UsageError(f"controller.eta: {axis.name} is {eta[-1]:g}; give a positive distance")
+        _refuse_unknown("eta", given, names, "unknown; expected")
         nx = len(goal.stay.axes)
         ranges = zip(inputs.low, inputs.high, eta[nx:], strict=True)
         return Grid.scots(goal.stay, tuple(eta[:nx])), tuple(multiples(a, b, e) for a, b, e in ranges)
 
     def _on(self, names: tuple[str, ...]) -> tuple[int, ...]:
-        for name in self.on or ():
-            if name not in names:
-                raise UsageError(f"controller.on: '{name}' is no state; expected some of {', '.join(names)}")
+        _refuse_unknown("on", self.on or (), names, "no state; expected some of")
         return tuple(j for j, name in enumerate(names) if self.on is None or name in self.on)
 
     def _ranges(self, domain: Domain) -> Box:
         """The inputs in use."""
-        given, box = dict(self.input_range or {}), domain.inputs
-        for name in given:
-            if name not in box.names:
-                raise UsageError(f"controller.input_range: '{name}' is no input; expected {', '.join(box.names)}")
+        given, box = self.input_range or {}, domain.inputs
+        _refuse_unknown("input_range", given, box.names, "no input; expected")
         ends = [given.get(a.name, (low, high)) for a, low, high in zip(box.axes, box.low, box.high, strict=True)]
         units = [a.unit for a in box.axes]
         low, high = (tuple(magnitude(e[k], unit) for e, unit in zip(ends, units, strict=True)) for k in (0, 1))
@@ -175,28 +157,21 @@ class Symbolic(Synthesizer):
 
         added = None if problem.gap is None else disturbance(problem.gap, grid, axes, tick=tick("gap over cells"))
         made = self._made(problem, plan, added, tick("successors of cells"))
-        evidence = problem.basis | _counted(grid, axes, made)
-        finer = self._refined(problem, plan, made, tick) if self.refine else None
-        if finer is not None:
-            evidence |= finer.facts()
+        found = self._refined(problem, plan, made, tick) if self.refine else made
+        evidence = problem.basis | made.facts() | found.facts()
         if added is not None and made.tabled and math.prod(added.r.lo.shape[:2]) > 1:
             evidence["gap_over_cells"] = dict(made.paths().told)
         if plan.held is not None:
             evidence["held"] = {n: [a, b] for n, a, b in zip(plan.held.names, plan.held.low, plan.held.high, strict=True)}
         if self.growth is not None:
             evidence["assumptions"] = [TRUSTED, *([SEEN] if inferred(problem.model, grid, axes) else [])]
-        if not (made.wins if finer is None else finer.won(1 if made.beyond else 0)):
+        if not found.won(1 if made.beyond else 0):
             evidence |= self._reason(problem, plan, added, made)
-        points = corners(list(axes), list(axes))[0]
-        solution, labels, edges = made.solution, made.labels, grid.edges
-        more: dict[str, Any] = {"held": plan.held, "promised": made.promised() if finer is None else finer.promised()}
-        if finer is not None:
-            solution, labels, edges = finer.solution, finer.labels, finer.windows[-1].grid.edges
-            more["splits"] = finer.splits
-        more["lasting"] = solution.lasting
+        points, solution, labels = combined(axes), found.solution, found.labels
+        more: dict[str, Any] = {"held": plan.held, "promised": found.promised(), "splits": found.splits}
 
         def grids(bits: Any, values: Any, evidence: dict[str, Any]) -> GridController:
-            return GridController(goal, edges, points, bits, values, evidence, **more)
+            return GridController(goal, found.edges, points, bits, values, evidence, lasting=solution.lasting, **more)
 
         if labels is None:
             return grids(solution.bits, solution.values, evidence)
@@ -212,8 +187,7 @@ class Symbolic(Synthesizer):
             allowed = offered(problem.domain, grid, plan.axes, cell)
             return windows(bound, grid, plan.axes, added, allowed=allowed, tick=tick("successors of cells"), cell=cell)
 
-        by = refined if problem.goal.automaton is None else refined_product
-        return by(problem.goal, self.refine, made.solution, made.paths(), windows_on)
+        return refined(problem.goal, self.refine, made.solution, made.paths(), windows_on)
 
     def _made(self, problem: SynthesisProblem, plan: _Plan, added: Disturbance | None, tick: Any = None) -> _Made:
         """The fixpoint on a plan, with [l, u] over its cells."""
@@ -221,11 +195,10 @@ class Symbolic(Synthesizer):
         allowed, bound = offered(problem.domain, grid, axes), self._bound(problem.model, grid)
         paths = cache(lambda: windows(bound, grid, axes, added, tick=tick, allowed=allowed))
         safe = cache(lambda: _safe(grid, goal))
-        for name, region in _asked(goal):
-            for box in region.boxes:
-                _refuse_held(name, box, plan.held)
+        if plan.held is not None:
+            _refuse_held(goal, plan.held)
         labels = Labels.of(grid, goal.regions) if goal.automaton else None
-        target = np.zeros(grid.size, dtype=bool) if goal.target is None else inside(grid, goal.target)
+        target = grid.inside(goal.target)
         inputs = math.prod(len(a) for a in plan.axes)
         dynamics = Dynamics(bound, grid, axes, added, allowed) if goal.kind == "invariance" else None
         # What a solver without tables is given it may take for its own.
@@ -238,20 +211,18 @@ class Symbolic(Synthesizer):
     def _reason(self, problem: SynthesisProblem, plan: _Plan, added: Disturbance | None, made: _Made) -> dict[str, Any]:
         """Why nothing wins, and what would have to change."""
         grid = plan.grid
-        if text := unlabelled(problem.goal, made.labels):
-            cause = Cause(text)
-        else:
-            cause = why_empty(problem, added, made.paths(), made.safe(), made.target, plan.inputs)
+        cause = why_empty(problem, made.labels, added, made.paths, made.safe(), made.target, plan.inputs)
 
         def wins(scale: float, factor: int) -> bool:
             finer = Grid(grid.box, tuple(n * factor for n in grid.counts), grid.on, grid.frame) if factor > 1 else grid
             over = added if factor == 1 or problem.gap is None else disturbance(problem.gap, finer, plan.axes)
             if over is not None and scale < 1:
                 over = over.scaled(scale)
-            return self._made(problem, _Plan(finer, plan.axes, plan.inputs, plan.held), over).wins
+            found = self._made(problem, plan._replace(grid=finer), over)
+            return found.won(1 if found.beyond else 0) > 0
 
         change = tried(wins, grid, made.inputs, added is not None)
-        beyond = "nothing beyond the target: " if made.winning() else ""
+        beyond = "nothing beyond the target: " if made.won() else ""
         return {"reason": beyond + cause.text + in_words(change), "change": {**cause.change, **change}}
 
 
@@ -268,6 +239,11 @@ class _Made(NamedTuple):
     labels: Labels | None
     solution: Solution
     tabled: bool
+    splits: None = None
+
+    @property
+    def edges(self) -> tuple[Array, ...]:
+        return self.grid.edges
 
     def promised(self) -> Successors | Callable[[], Successors | None] | None:
         """What a step promises, tabled where it is asked for; None where the tables are too large."""
@@ -279,21 +255,27 @@ class _Made(NamedTuple):
     def _tables(self) -> Successors | None:
         return self.paths().successors.unless_large()
 
-    def winning(self, least: int = 0) -> int:
+    def won(self, least: int = 0) -> int:
         """Cells of at least this value, with the memory that a run begins with there."""
         values = self.solution.values
         if self.goal.automaton is not None and self.labels is not None:
             return int(started(self.goal.automaton, self.labels, values >= least).sum())
         return sum(int(np.count_nonzero(values[k : k + CHUNK] >= least)) for k in range(0, len(values), CHUNK))
 
-    @property
-    def wins(self) -> bool:
-        """Does any cell, beyond the target where the goal ends there and leaves others?"""
-        return self.winning(1 if self.beyond else 0) > 0
+    def facts(self) -> dict[str, Any]:
+        automaton, winning = self.goal.automaton, self.won()
+        return {
+            "cells": self.grid.size,
+            "inputs": self.inputs,
+            "winning_cells": winning,
+            "winning_fraction": winning / self.grid.size,
+            "rounds": self.solution.rounds,
+            **({} if automaton is None else {"automaton_states": len(automaton.after)}),
+        }
 
     @property
     def beyond(self) -> bool:
-        """Must there be a step, for anything to be won?"""
+        """Must there be a step, for anything to be won? So it is where the goal ends at a target that leaves other cells."""
         return self.goal.kind == "reach_avoid" and bool((self.safe() & ~self.target).any())
 
 
@@ -308,22 +290,17 @@ class _Plan(NamedTuple):
 
 
 def _safe(grid: Grid, goal: Goal) -> Bools:
-    safe = np.ones(grid.size, dtype=bool) if grid.nodes is None else grid.inside(goal.stay)
-    if goal.avoid is not None:
-        safe &= ~touching(grid, goal.avoid)
-    return safe
-
-
-def _asked(goal: Goal) -> list[tuple[str, Region]]:
-    """The regions that cells must be told to lie in, with their names."""
-    names = goal.automaton.propositions if goal.automaton else ()
-    target = [] if goal.target is None else [("target", goal.target)]
-    return [*target, *((f"region {name}", region) for name, region in zip(names, goal.regions, strict=True))]
+    safe = ~grid.touching(goal.avoid)
+    return safe if grid.nodes is None else safe & grid.inside(Region((goal.stay,)))
 
 
 def _solve(goal: Goal, problem: Problem, target: Bools, labels: Labels | None) -> Solution:
     if goal.automaton is not None and labels is not None:
-        by = dense.Positions if problem.solver == "jax" else None
+        by: Any = None
+        if problem.solver == "jax":
+            from .solvers import dense
+
+            by = dense.Positions
         return product(problem.windows(), problem.safe, goal.automaton, labels, by)
     if goal.kind in ("invariance", "reach_avoid"):
         return solve(problem if goal.kind == "invariance" else replace(problem, target=target))
@@ -331,44 +308,40 @@ def _solve(goal: Goal, problem: Problem, target: Bools, labels: Labels | None) -
 
 
 def _grid(goal: Goal, on: tuple[int, ...], held: Box | None, counts: tuple[int, ...]) -> Grid:
-    box = over(goal.stay, on)
+    stay = goal.stay
+    box = Box(tuple(stay.axes[j] for j in on), tuple(stay.low[j] for j in on), tuple(stay.high[j] for j in on))
     if held is None:
         return Grid(box, counts)
-    ranges = {**dict(zip(held.names, zip(held.low, held.high, strict=True), strict=True))}
-    ends = zip(goal.stay.names, goal.stay.low, goal.stay.high, strict=True)
+    ranges = dict(zip(held.names, zip(held.low, held.high, strict=True), strict=True))
+    ends = zip(stay.names, stay.low, stay.high, strict=True)
     return Grid(box, counts, on, np.array([ranges.get(name, (low, high)) for name, low, high in ends]))
 
 
-def _refuse_held(what: str, target: Box, held: Box | None) -> None:
-    """A target cannot ask for what the cells do not tell apart."""
-    for name, low, high in zip(held.names, held.low, held.high, strict=True) if held is not None else ():
-        a, b = ((target.low, target.high)[k][target.names.index(name)] for k in (0, 1))
-        if low < a or high > b:
-            raise UsageError(
-                f"goal: {what} asks for {name} in [{a:g}, {b:g}], and the controller, which has no cells for it, keeps it in "
-                f"[{low:g}, {high:g}]; leave it out there, or add it to controller.on"
-            )
+def _refuse_held(goal: Goal, held: Box) -> None:
+    """What is to be reached or visited cannot ask for what the cells do not tell apart."""
+    names = goal.automaton.propositions if goal.automaton else ()
+    regions = [("target", goal.target), *((f"region {name}", region) for name, region in zip(names, goal.regions, strict=True))]
+    for what, box in ((what, box) for what, region in regions for box in (region.boxes if region else ())):
+        for name, low, high in zip(held.names, held.low, held.high, strict=True):
+            j = goal.stay.names.index(name)
+            if low < box.low[j] or high > box.high[j]:
+                raise UsageError(
+                    f"goal: {what} asks for {name} in [{box.low[j]:g}, {box.high[j]:g}], and the controller, which has no "
+                    f"cells for it, keeps it in [{low:g}, {high:g}]; leave it out there, or add it to controller.on"
+                )
 
 
-def _counted(grid: Grid, axes: tuple[Array, ...], made: _Made) -> dict[str, Any]:
-    automaton, winning = made.goal.automaton, made.winning()
-    return {
-        "cells": grid.size,
-        "inputs": math.prod(len(a) for a in axes),
-        "winning_cells": winning,
-        "winning_fraction": winning / grid.size,
-        "rounds": made.solution.rounds,
-        **({} if automaton is None else {"automaton_states": len(automaton.after)}),
-    }
+def _refuse_unknown(option: str, given: Iterable[str], names: Sequence[str], told: str) -> None:
+    if unknown := [name for name in given if name not in names]:
+        raise UsageError(f"controller.{option}: '{unknown[0]}' is {told} {', '.join(names)}")
 
 
-def _counts(field: str, given: Mapping[str, int], names: tuple[str, ...]) -> tuple[int, ...]:
-    least = 1 if field == "cells" else 2
+def _counts(option: str, given: Mapping[str, int], names: tuple[str, ...]) -> tuple[int, ...]:
+    least = 1 if option == "cells" else 2
+    _refuse_unknown(option, given, names, "unknown; expected")
     for name, number in given.items():
-        if name not in names:
-            raise UsageError(f"controller.{field}: '{name}' is unknown; expected {', '.join(names)}")
         if number < least:
-            raise UsageError(f"controller.{field}: {name} is {number}; give at least {least}")
+            raise UsageError(f"controller.{option}: {name} is {number}; give at least {least}")
     if missing := [n for n in names if n not in given]:
-        raise UsageError(f"controller.{field}: nothing for '{missing[0]}'; add {missing[0]}: a number")
+        raise UsageError(f"controller.{option}: nothing for '{missing[0]}'; add {missing[0]}: a number")
     return tuple(int(given[n]) for n in names)

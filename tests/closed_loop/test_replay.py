@@ -11,7 +11,7 @@ from scipy.stats import beta
 from gapcert import Backend, Box, Goal, Interval
 from gapcert.plugin import POLICIES
 from gapcert_cells import GridController
-from gapcert_cells.successors import depths
+from gapcert_cells.grid_controller import depths
 from gapcert_cells.testing import Band, Rod, rod_problem, rod_reach_avoid
 from gapcert_closed_loop.closed_loop import closed_loop, compare_loops
 from gapcert_closed_loop.loop_audit import Oracle, audited, largest, loop_failures

@@ -15,7 +15,7 @@ import pytest
 from gapcert import Box, Ellipsoid, Goal, Polytope, Region, StateSpec, UsageError
 from gapcert.plugin import Relation
 from gapcert_cells import Along, GridController, Successors
-from gapcert_cells.successors import depths
+from gapcert_cells.grid_controller import depths
 
 AXES = (StateSpec("x", "m"), StateSpec("y", "m"))
 M = 11

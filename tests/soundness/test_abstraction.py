@@ -8,20 +8,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+import touched
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gapcert_symbolic.cells.abstraction as abstraction
-import gapcert_symbolic.cells.nominal as nominal
+import gapcert_symbolic.cells.bounds as bounds
 from gapcert import Box, GapFunction, Interval, Model, StateSpec
 from gapcert.plugin import Extension
 from gapcert.testing.toys import Drift
 from gapcert_cells.testing import Rod
 from gapcert_symbolic.cells.abstraction import Windows, windows
-from gapcert_symbolic.cells.bounds import Enclosed
+from gapcert_symbolic.cells.bounds import Enclosed, Nominal
 from gapcert_symbolic.cells.gaps import disturbance
-from gapcert_symbolic.cells.grid import Grid, corners
-from gapcert_symbolic.cells.nominal import Nominal
+from gapcert_symbolic.cells.grid import Grid, View, combined
 
 
 class Toy(Model):
@@ -131,7 +131,7 @@ def abstract(model: Model, gap: GapFunction | None, grid: Grid, axes: tuple[np.n
 def escapes(model: Model, gap: GapFunction | None, grid: Grid, axes: tuple[np.ndarray, ...], paths: Windows, seed: int) -> int:
     """How many of 4,000 sampled successors lie in a cell that their window leaves out."""
     rng, n = np.random.default_rng(seed), 4000
-    points = corners(list(axes), list(axes))[0]
+    points = combined(axes)
     cell, which = rng.integers(grid.size, size=n), rng.integers(len(points), size=n)
     low, high = (np.stack([c[i] for i in cell]) for c in grid.cells(0, grid.size))
     share = rng.random(low.shape)
@@ -141,7 +141,7 @@ def escapes(model: Model, gap: GapFunction | None, grid: Grid, axes: tuple[np.nd
     if gap is not None:
         ends = gap.interval(np.hstack([x, points[which]]))
         after = after + np.where(rng.random(after.shape) < 0.5, *ends)
-    missed, ends = np.zeros(n, dtype=bool), paths.ends(cell, which)
+    missed, ends = np.zeros(n, dtype=bool), touched.ends(paths, cell, which)
     for k, edges in enumerate(grid.edges):
         count, (first, last) = grid.counts[k], (end[:, k] for end in ends)
         y = after[:, k]
@@ -198,7 +198,7 @@ def test_of_axes_that_share_a_table_each_moves_by_itself() -> None:
         assert escapes(model, gap, grid, axes, paths, seed=0) == 0
         assert [axis.moves for axis in paths.axes] == [False, gap is None]
         cells = np.arange(grid.size)
-        first, last = paths.ends(cells, np.zeros(grid.size, dtype=np.int64))
+        first, last = touched.ends(paths, cells, np.zeros(grid.size, dtype=np.int64))
         assert (last - first <= 3).all()
 
 
@@ -268,7 +268,7 @@ def test_one_ulp_inwards_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(autouse=True)
 def _groups(monkeypatch: pytest.MonkeyPatch) -> None:
     """These problems have few pairs; inputs share slopes all the same."""
-    monkeypatch.setattr(nominal, "THRESHOLDS", replace(nominal.THRESHOLDS, single_pairs=0))
+    monkeypatch.setattr(bounds, "THRESHOLDS", replace(bounds.THRESHOLDS, single_pairs=0))
 
 
 def grouped(monkeypatch: pytest.MonkeyPatch, size: int) -> None:
@@ -288,10 +288,10 @@ def test_groups_lose_less_than_promised(monkeypatch: pytest.MonkeyPatch) -> None
     """Windows from shared inputs contain those from one evaluation per input, and are at most one cell wider."""
     for model, grid, axes in CASES:
         pairs = np.indices((grid.size, len(axes[0]) * (len(axes[1]) if len(axes) > 1 else 1))).reshape(2, -1)
-        shared = windows(Enclosed(model), grid, axes, None).ends(*pairs)
+        shared = touched.ends(windows(Enclosed(model), grid, axes, None), *pairs)
         with monkeypatch.context() as patched:
             grouped(patched, 1000)
-            direct = windows(Enclosed(model), grid, axes, None).ends(*pairs)
+            direct = touched.ends(windows(Enclosed(model), grid, axes, None), *pairs)
         for k in range(len(grid.counts)):
             if not grid.wraps[k]:
                 assert (shared[0][:, k] >= direct[0][:, k] - 1).all()
@@ -299,7 +299,8 @@ def test_groups_lose_less_than_promised(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_coarsest_shares_where_it_may() -> None:
-    rod, cart = (Nominal.coarsest(Enclosed(CASES[i][0]), *CASES[i][1:]) for i in (0, 2))
+    cases = ((Enclosed(model), View(grid, tuple(range(len(grid.counts)))), axes) for model, grid, axes in (CASES[0], CASES[2]))
+    rod, cart = (Nominal.coarsest(*case) for case in cases)
     assert len(rod.middle) == 1
     # The effect of v changes within a cell by far more than a thousandth of it; that of w is the same everywhere.
     assert len(np.unique(cart.middle[:, 0])) == 7

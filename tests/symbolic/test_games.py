@@ -16,7 +16,6 @@ from gapcert_cells import GridController
 from gapcert_cells.testing import Band, Rod, rod_problem
 from gapcert_symbolic.cells.bounds import Enclosed
 from gapcert_symbolic.cells.grid import Grid
-from gapcert_symbolic.games.games import inside, touching
 from gapcert_symbolic.synthesizer import Symbolic
 
 Cell = tuple[int, ...]
@@ -128,7 +127,7 @@ def test_rod_equals_the_fixpoints(kind: str, gap: Any) -> None:
     controller = agrees(problem, {"theta": 32, "omega": 24}, {"torque": 7})
     assert 0 < controller.evidence["winning_cells"] < 32 * 24
     # Some cells of the target can neither be kept nor left for another visit.
-    target = inside(Grid(problem.goal.stay, (32, 24)), problem.goal.target)
+    target = Grid(problem.goal.stay, (32, 24)).inside(problem.goal.target)
     assert (controller.values[target] != 0).any()
 
 
@@ -217,7 +216,7 @@ def test_shapes_shrink_as_targets_and_grow_as_obstacles(region: Region) -> None:
     low, high = grid.cells(0, grid.size)
     x = sampled(low, high, np.random.default_rng(0))
     within = region.contains(x.reshape(-1, 2)).reshape(len(low), -1)
-    whole, some = inside(grid, region), touching(grid, region)
+    whole, some = grid.inside(region), grid.touching(region)
     assert within[whole].all()
     assert not within[~some].any()
     # Exact up to the cells whose border is met between the samples.
@@ -230,10 +229,10 @@ def test_a_cell_that_ends_at_the_border_is_not_trusted_to_be_inside_when_that_de
     square = box(Drift(2), (0.0, 0.0), (1.0, 1.0))
     grid = Grid(square, (8, 8))
     half = Region(polytopes=(Polytope(square, (Relation("", (0.1, 0.0), 0.05),)),))
-    assert inside(grid, half).reshape(8, 8)[:, 0].tolist() == [True] * 3 + [False] * 5
-    assert touching(grid, half).reshape(8, 8)[:, 0].tolist() == [True] * 5 + [False] * 3
+    assert grid.inside(half).reshape(8, 8)[:, 0].tolist() == [True] * 3 + [False] * 5
+    assert grid.touching(half).reshape(8, 8)[:, 0].tolist() == [True] * 5 + [False] * 3
     more = Region(polytopes=(Polytope(square, (Relation("", (0.1, 0.0), 0.05 + 1e-15),)),))
-    assert inside(grid, more).reshape(8, 8)[:, 0].tolist() == [True] * 4 + [False] * 4
+    assert grid.inside(more).reshape(8, 8)[:, 0].tolist() == [True] * 4 + [False] * 4
 
 
 def test_shapes_over_an_angle_count_modulo_a_turn() -> None:
@@ -244,7 +243,7 @@ def test_shapes_over_an_angle_count_modulo_a_turn() -> None:
     low, high = grid.cells(0, grid.size)
     x = sampled(low, high, np.random.default_rng(1))
     within = ball.contains(x.reshape(-1, 2)).reshape(len(low), -1)
-    whole, some = inside(grid, ball), touching(grid, ball)
+    whole, some = grid.inside(ball), grid.touching(ball)
     assert within[whole].all()
     assert not within[~some].any()
     rows = whole.reshape(32, 8).any(axis=1)

@@ -21,7 +21,7 @@ from gapcert_cells.testing import Band
 from gapcert_closed_loop.closed_loop import compare_loops
 from gapcert_symbolic.cells.abstraction import windows
 from gapcert_symbolic.cells.bounds import Enclosed
-from gapcert_symbolic.cells.grid import Grid, corners
+from gapcert_symbolic.cells.grid import Grid, combined
 from gapcert_symbolic.games.automata import Labels, product
 from gapcert_symbolic.synthesizer import Symbolic
 
@@ -36,7 +36,7 @@ def explicit(given: SynthesisProblem, side: int) -> tuple[set[tuple[int, int]], 
     axes = (np.linspace(-1, 1, 3),) * 2
     gap = given.gap.interval(np.zeros((1, 4))) if given.gap is not None else None
     lower, upper = grid.cells(0, grid.size)
-    points = corners(list(axes), list(axes))[0]
+    points = combined(axes)
     edges = grid.edges[0]
 
     def read(cell: int) -> list[int]:
@@ -213,7 +213,7 @@ def test_a_border_cell_is_not_trusted() -> None:
     middles = np.concatenate([(a + b) / 2 for a, b in [grid.cells(0, 20)]])
     centre = sum(r.contains(middles).astype(np.int64) << p for p, r in enumerate(regions))
     goal = Goal("automaton", domain.states, None, None, automaton, regions)
-    points = corners(list(axes), list(axes))[0]
+    points = combined(axes)
 
     def made(labels: Labels) -> AutomatonController:
         solution = product(paths, np.ones(20, dtype=bool), automaton, labels)

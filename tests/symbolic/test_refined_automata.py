@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import touched
 from exported import driven, imported, replayed
 from halving import nested
 from tasks import AGAIN, REGIONS, ROCS, SPEC, problem
@@ -22,10 +23,9 @@ from gapcert_cells import AutomatonController, automaton_of, read_hoa
 from gapcert_cells.export.export import export
 from gapcert_cells.testing import Band
 from gapcert_symbolic.cells.abstraction import Windows
-from gapcert_symbolic.games import games, refined_automata
+from gapcert_symbolic.games import refinement
 from gapcert_symbolic.games.automata import Labels, leads_of, product, started
-from gapcert_symbolic.games.refined_automata import refined_product
-from gapcert_symbolic.games.refinement import Refined
+from gapcert_symbolic.games.refinement import Refined, refined
 from gapcert_symbolic.solvers.problem import Solution
 from gapcert_symbolic.synthesizer import Symbolic
 from gapcert_symbolic.thresholds import THRESHOLDS
@@ -45,7 +45,7 @@ def goal_of(box: Box, automaton: Automaton, rng: np.random.Generator) -> Goal:
 
 def solved(windows: Windows, goal: Goal) -> tuple[Solution, Labels]:
     assert goal.automaton is not None
-    safe = np.ones(windows.grid.size, dtype=bool) if goal.avoid is None else ~games.touching(windows.grid, goal.avoid)
+    safe = ~windows.grid.touching(goal.avoid)
     labels = Labels.of(windows.grid, goal.regions)
     return product(windows, safe, goal.automaton, labels), labels
 
@@ -56,7 +56,7 @@ def drawn(rng: np.random.Generator) -> tuple[list[Windows], Goal, Refined, np.nd
     made = nested(int(rng.integers(1, 3)), int(rng.integers(1, 4)), levels, rng)
     goal, by_grid = goal_of(made[0].grid.box, automaton, rng), {w.grid.counts: w for w in made}
     coarse = solved(made[0], goal)[0]
-    found = refined_product(goal, levels, coarse, made[0], lambda grid, _: by_grid[grid.counts])
+    found = refined(goal, levels, coarse, made[0], lambda grid, _: by_grid[grid.counts])
     return made, goal, found, replace(found.splits, levels=levels).painted()
 
 
@@ -96,7 +96,7 @@ def kept(made: list[Windows], goal: Goal, found: Refined, painted: np.ndarray) -
         if not len(inputs):
             return False
         for j in inputs:
-            first, last = (e[0] for e in windows.ends(np.array([cell]), np.array([j])))
+            first, last = (e[0] for e in touched.ends(windows, np.array([cell]), np.array([j])))
             sides = zip(first << left, (last + 1) << left, fine.counts, fine.wraps, strict=True)
             ranges = [np.arange(a, b) % c if w else np.arange(a, b) for a, b, c, w in sides]
             if any(r[0] < 0 or r[-1] >= c for r, c in zip(ranges, fine.counts, strict=True)):
@@ -123,7 +123,7 @@ def test_each_input_leads_to_what_can_be_entered_in_fewer_steps() -> None:
 
 def test_without_the_borders_of_regions_cells_are_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     """Planted fault: cells are halved only for the positions that lose there, not for the readings of their parts."""
-    monkeypatch.setattr(refined_automata, "_in_part", lambda leads, kind, *given: np.zeros(len(kind), dtype=bool))
+    monkeypatch.setattr(refinement, "_in_part", lambda leads, kind, *given: np.zeros(len(kind), dtype=bool))
     rng, lost = np.random.default_rng(2), 0
     for _ in range(80):
         made, goal, found, painted = drawn(rng)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import touched
 import yaml
 from halving import nested
 from hypothesis import given, settings
@@ -24,9 +25,9 @@ from gapcert_report.pages.page import controller as section
 from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.games import games, refinement
+from gapcert_symbolic.games.games import solve
 from gapcert_symbolic.games.refinement import Refined, refined
 from gapcert_symbolic.solvers.problem import Problem, Solution
-from gapcert_symbolic.solvers.solvers import solve
 from gapcert_symbolic.synthesizer import Symbolic
 
 GOALS = ("invariance", "reach_avoid", "reach_and_stay", "recurrence")
@@ -45,8 +46,7 @@ def goal_of(box: Box, kind: Any, rng: np.random.Generator) -> Goal:
 
 
 def masks(grid: Grid, goal: Goal) -> tuple[np.ndarray, np.ndarray]:
-    safe = np.ones(grid.size, dtype=bool) if goal.avoid is None else ~games.touching(grid, goal.avoid)
-    return safe, np.zeros(grid.size, dtype=bool) if goal.target is None else games.inside(grid, goal.target)
+    return ~grid.touching(goal.avoid), grid.inside(goal.target)
 
 
 def solved(windows: Windows, goal: Goal) -> Solution:
@@ -107,7 +107,7 @@ def test_each_input_leads_into_the_domain_in_fewer_steps_and_none_is_left_out(
         cell = np.ravel_multi_index(tuple(splits.index[node]), windows.grid.counts)
         best = np.iinfo(np.int32).max
         for j in np.flatnonzero(allowed):
-            first, last = (e[0] for e in windows.ends(np.array([cell]), np.array([j])))
+            first, last = (e[0] for e in touched.ends(windows, np.array([cell]), np.array([j])))
             sides = zip(first << left, (last + 1) << left, shown.shape, windows.grid.wraps, strict=True)
             ranges = [np.arange(a, b) % c if w else np.arange(a, b) for a, b, c, w in sides]
             inside = all(r[0] >= 0 and r[-1] < c for r, c in zip(ranges, shown.shape, strict=True))
@@ -141,7 +141,7 @@ def test_goals_that_never_end_win_what_the_fine_grid_wins_beside_what_was_won(ki
 @pytest.mark.parametrize("kind", ["reach_and_stay", "recurrence"])
 def test_less_hope_loses_cells(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Planted fault: what touches the target, but does not lie inside, is taken for nothing of it."""
-    monkeypatch.setattr(refinement, "touching", lambda grid, region, cell: games.inside(grid, region, cell))
+    monkeypatch.setattr(Grid, "touching", Grid.inside)
     rng, fewer = np.random.default_rng(3), 0
     for _ in range(60):
         made = nested(1, 3, 2, rng)

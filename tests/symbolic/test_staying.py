@@ -19,8 +19,8 @@ from gapcert_cells.testing import Band
 from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.games import games
+from gapcert_symbolic.games.games import solve
 from gapcert_symbolic.solvers.problem import Problem, Solution
-from gapcert_symbolic.solvers.solvers import solve
 from gapcert_symbolic.synthesizer import Symbolic
 
 TURN = 2 * np.pi

@@ -205,11 +205,11 @@ def test_targets_shrink_and_obstacles_grow() -> None:
     model = Drift(1)
     grid = Grid(box(model, 0.0, 1.0), (10,))
     part = box(model, 0.25, 0.55)
-    assert np.flatnonzero(grid.inside(part)).tolist() == [3, 4]
-    assert np.flatnonzero(grid.touching(part)).tolist() == [2, 3, 4, 5]
+    assert np.flatnonzero(grid.inside(Region((part,)))).tolist() == [3, 4]
+    assert np.flatnonzero(grid.touching(Region((part,)))).tolist() == [2, 3, 4, 5]
     edge = Box(model.states, (float(grid.edges[0][3]),), (float(grid.edges[0][5]),))
-    assert np.flatnonzero(grid.inside(edge)).tolist() == [3, 4]
-    assert np.flatnonzero(grid.touching(edge)).tolist() == [2, 3, 4, 5]
+    assert np.flatnonzero(grid.inside(Region((edge,)))).tolist() == [3, 4]
+    assert np.flatnonzero(grid.touching(Region((edge,)))).tolist() == [2, 3, 4, 5]
 
 
 def test_grid_tiles_the_set_exactly() -> None:

@@ -16,7 +16,7 @@ from gapcert_functions import mean_value
 from gapcert_symbolic.cells.abstraction import windows
 from gapcert_symbolic.cells.bounds import Bound, Enclosed
 from gapcert_symbolic.cells.gaps import disturbance
-from gapcert_symbolic.cells.grid import Grid, View, corners
+from gapcert_symbolic.cells.grid import Grid, View, combined
 from gapcert_symbolic.synthesizer import Symbolic
 
 VEHICLE = Path(__file__).parents[2] / "specs" / "benchmarks" / "vehicle.yaml"
@@ -107,7 +107,7 @@ def test_the_vehicle_needs_no_declared_growth_bound() -> None:
     """Mean widths over all headings and inputs: close to those of the successors themselves, and below the declared ones."""
     _, problem, grown, grid, axes = published()
     low, high = View(grid, (2,)).cells(0, grid.counts[2])
-    points = corners(list(axes), list(axes))[0][::8]
+    points = combined(axes)[::8]
     n, m = len(low), len(points)
     rows = np.repeat(low, m, axis=0), np.repeat(high, m, axis=0), np.tile(points, (n, 1))
     box, reached, declared = Enclosed(problem.model).over(*rows), hull(problem.model, *rows, draws=20), grown.over(*rows)

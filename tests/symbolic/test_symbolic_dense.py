@@ -18,9 +18,8 @@ from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.games import games
 from gapcert_symbolic.games.automata import Labels, product
-from gapcert_symbolic.solvers import dense
+from gapcert_symbolic.games.games import solve
 from gapcert_symbolic.solvers.problem import Play, Problem, Solution
-from gapcert_symbolic.solvers.solvers import solve
 from gapcert_symbolic.synthesizer import Symbolic
 
 pytestmark = pytest.mark.needs("jax")
@@ -104,6 +103,8 @@ def labelled(windows: Windows, seed: int) -> Labels:
 
 def both(seed: int, shape: int) -> list[tuple[Solution, Solution]]:
     """Products with each automaton: on JAX, and compiled."""
+    from gapcert_symbolic.solvers import dense
+
     windows = drawn(seed, *SHAPES[shape])
     safe, labels = np.random.default_rng(seed).random(windows.grid.size) < 0.99, labelled(windows, seed)
     return [(product(windows, safe, a, labels, dense.Positions), product(windows, safe, a, labels)) for a in AUTOMATA]
@@ -126,6 +127,7 @@ def test_games_with_automata_are_equal(shape: int) -> None:
 @pytest.mark.parametrize("fault", ["nowhere", "readings"])
 def test_a_reading_that_is_forgotten_is_noticed(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Cells that may lead nowhere, or into a state that has not won, must not be entered."""
+    from gapcert_symbolic.solvers import dense
 
     class Careless(dense.Positions):
         def __init__(self, play: Play) -> None:

@@ -11,9 +11,9 @@ from gapcert import Box, StateSpec
 from gapcert_cells import Along
 from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
+from gapcert_symbolic.games.games import solve
 from gapcert_symbolic.solvers import erosion, runs
 from gapcert_symbolic.solvers.problem import Problem
-from gapcert_symbolic.solvers.solvers import solve
 
 TURN = 2 * np.pi
 

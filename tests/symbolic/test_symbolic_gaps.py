@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import touched
 
 import gapcert_symbolic.cells.gaps as gaps
 from gapcert import Array, Box, GapFunction, Interval
@@ -16,7 +17,7 @@ from gapcert_report.words.words import suprema
 from gapcert_symbolic.cells.abstraction import Windows, windows
 from gapcert_symbolic.cells.bounds import Enclosed
 from gapcert_symbolic.cells.gaps import disturbance
-from gapcert_symbolic.cells.grid import Grid, corners, share
+from gapcert_symbolic.cells.grid import Grid, combined, share
 
 GRID = Grid(Box(Drift(2).states, (-1.0, -1.0), (1.0, 1.0)), (20, 24))
 AXES = (np.linspace(-0.5, 0.5, 7), np.linspace(-0.5, 0.5, 5))
@@ -54,13 +55,13 @@ def made(gap: GapFunction, budget: int = 100_000) -> Windows:
 
 def escapes(gap: GapFunction, paths: Windows, n: int = 20_000) -> int:
     """How many sampled successors, under the ends of the gap, lie in a cell that their window leaves out."""
-    rng, points = np.random.default_rng(1), corners(list(AXES), list(AXES))[0]
+    rng, points = np.random.default_rng(1), combined(AXES)
     cell, which = rng.integers(GRID.size, size=n), rng.integers(len(points), size=n)
     low, high = GRID.boxes(cell)
     x = low + (high - low) * rng.random(low.shape)
     ends = gap.interval(np.hstack([x, points[which]]))
     after = Drift(2).step(x, points[which]).x + np.where(rng.random(x.shape) < 0.5, *ends)
-    first, last = paths.ends(cell, which)
+    first, last = touched.ends(paths, cell, which)
     index = np.stack([np.searchsorted(e, a, "right") - 1 for e, a in zip(GRID.edges, after.T, strict=True)], axis=1)
     return int(((index < first) | (index > last)).any(axis=1).sum())
 
@@ -84,7 +85,7 @@ def test_coordinates_that_cost_least_go_first(monkeypatch: pytest.MonkeyPatch) -
         assert escapes(STEEP, short) == 0
         assert sizes(short) < last
         last = sizes(short)
-        ends = whole.ends(*pairs), short.ends(*pairs)
+        ends = touched.ends(whole, *pairs), touched.ends(short, *pairs)
         assert (ends[1][0] <= ends[0][0]).all()
         assert (ends[1][1] >= ends[0][1]).all()
         if entries == 21_000:

@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gapcert import Interval, Model, SynthesisProblem, UsageError, run
+from gapcert import Interval, Model, Region, SynthesisProblem, UsageError, run
 from gapcert.cli.main import main
 from gapcert_cells.testing import Rod, rod_problem
 from gapcert_symbolic.cells.abstraction import windows
-from gapcert_symbolic.cells.bounds import Enclosed, Grown
+from gapcert_symbolic.cells.bounds import Enclosed, Grown, structure
 from gapcert_symbolic.cells.grid import Grid, multiples
-from gapcert_symbolic.cells.structure import structure
 from gapcert_symbolic.synthesizer import SEEN, TRUSTED, Symbolic
 
 
@@ -147,7 +146,7 @@ class Hiding(Opaque):
 def test_a_dependence_that_pairs_of_points_show_is_in_the_windows() -> None:
     """In a twentieth of the pairs; a window that leaves it out would be the same for all torques."""
     grid, axes = Grid(problem().goal.stay, (20, 40)), (np.linspace(-1, 1, 3),)
-    plain, hiding = (structure(model, grid, axes) for model in (Opaque(), Hiding()))
+    plain, hiding = (structure(Enclosed(model), grid, axes) for model in (Opaque(), Hiding()))
     assert [p.inputs for p in plain] == [(False,), (True,)]
     assert [p.inputs for p in hiding] == [(True,), (True,)]
     made = Symbolic(align="scots", eta=ETA, growth=Radii()).synthesize(replace(problem(), model=Hiding()))
@@ -196,7 +195,7 @@ def test_a_spec_names_the_model_of_radii(tmp_path: Path, capsys: pytest.CaptureF
 def test_cells_that_stick_out_are_not_safe() -> None:
     p = problem()
     grid = Grid.scots(p.goal.stay, (0.013, 0.02))
-    assert grid.inside(p.goal.stay).sum() < grid.size
+    assert grid.inside(Region((p.goal.stay,))).sum() < grid.size
     made = Symbolic(align="scots", eta={**ETA, "theta": 0.0043}, growth=Radii()).synthesize(p)
     x = made.draw(2000, np.random.default_rng(0))
     assert len(x)

@@ -12,12 +12,10 @@ from hypothesis import strategies as st
 from gapcert import Box, StateSpec
 from gapcert.plugin import Automaton, Bools
 from gapcert_cells import Along
-from gapcert_symbolic.cells import repeats
 from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
-from gapcert_symbolic.games import automata
-from gapcert_symbolic.kernels import inverse, reach
-from gapcert_symbolic.solvers import solvers
+from gapcert_symbolic.games import automata, games
+from gapcert_symbolic.kernels import reach, repeats
 from gapcert_symbolic.solvers.problem import Play
 
 TURN = 2 * np.pi
@@ -48,7 +46,7 @@ def both(windows: Windows, safe: Bools, target: Bools) -> list[tuple[np.ndarray,
     assert given is not None
     for threads in (1, 2):
         values, bits = start.copy(), windows.no_bits
-        inverse.reach(given, values, bits, windows.permitted, threads)
+        repeats.reach(given, values, bits, windows.permitted, threads)
         out.append((values, bits))
     assert np.array_equal(out[0][0], out[1][0])
     assert np.array_equal(out.pop()[1], out[0][1])
@@ -74,7 +72,7 @@ def test_both_ways_agree(n: int, m: int, seed: int, relations: bool) -> None:
 @pytest.mark.parametrize("nodes", [1, 1 << 12])
 def test_nodes_run_out(monkeypatch: pytest.MonkeyPatch, nodes: int) -> None:
     """More windows hang on cells than there is room for at first; several rounds, and neither nothing nor everything won."""
-    monkeypatch.setattr(inverse, "NODES", nodes)
+    monkeypatch.setattr(repeats, "NODES", nodes)
     rng = np.random.default_rng(11)
     windows = drawn(rng, (60, 9, 8), 12, (False, False, True), False)
     size = windows.grid.size
@@ -131,7 +129,8 @@ def test_both_ways_agree_on_positions(n: int, m: int, seed: int, relations: bool
 
 def test_threads_are_used_where_they_pay_or_are_asked_for() -> None:
     cores = len(os.sched_getaffinity(0))
-    assert [
-        solvers.usable(None, pairs) for pairs in (solvers.THRESHOLDS.threaded_pairs - 1, solvers.THRESHOLDS.threaded_pairs)
-    ] == [1, cores]
-    assert solvers.usable(3, 10) == 3
+    assert [games.usable(None, pairs) for pairs in (games.THRESHOLDS.threaded_pairs - 1, games.THRESHOLDS.threaded_pairs)] == [
+        1,
+        cores,
+    ]
+    assert games.usable(3, 10) == 3

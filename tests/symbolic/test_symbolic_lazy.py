@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import touched
 
 import gapcert as gc
 from gapcert import Box, Domain, GapFunction, Goal, Interval, Model, Region, StateSpec, SynthesisProblem
@@ -256,7 +257,7 @@ def hulls(windows: Windows) -> lazy.Ask:
         for p, (i, j) in enumerate(zip(block, which, strict=True)):
             part = np.ix_(*(range(c, min(c + size[i], n)) for c, n in zip(corner[i], counts, strict=True)))
             cell = np.arange(windows.grid.size).reshape(counts)[part].ravel()
-            ends = windows.ends(cell, np.full(len(cell), j))
+            ends = touched.ends(windows, cell, np.full(len(cell), j))
             first[p], last[p] = ends[0].min(axis=0), ends[1].max(axis=0)
             for k in np.flatnonzero(wraps & (last[p] - first[p] >= counts)):
                 first[p, k], last[p, k] = 0, counts[k] - 1

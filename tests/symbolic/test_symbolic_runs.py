@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import touched
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -43,7 +44,7 @@ def textbook(windows: Windows, safe: np.ndarray) -> tuple[np.ndarray, np.ndarray
     """As `solved`, from the window of every pair, looked at again until nothing changes."""
     m, counts, alive = windows.inputs, windows.grid.counts, safe.copy()
     pairs = np.indices((len(safe), m)).reshape(2, -1)
-    first, last = windows.ends(pairs[0], pairs[1])
+    first, last = touched.ends(windows, pairs[0], pairs[1])
     inside = ((first >= 0) & (last < np.array(counts))).all(axis=1)
     while True:
         whole, valid = alive.reshape(counts), np.zeros((len(safe), m), dtype=bool)
@@ -122,7 +123,7 @@ def test_an_axis_that_wraps_is_in_no_order() -> None:
 def test_rows_that_windows_touch(n: int, m: int, seed: int) -> None:
     windows, safe = drawn(n, m, seed, 0)
     pairs = np.indices((len(safe), m)).reshape(2, -1)
-    ends, n0 = windows.ends(pairs[0], pairs[1]), windows.grid.counts[0]
+    ends, n0 = touched.ends(windows, pairs[0], pairs[1]), windows.grid.counts[0]
     first, last = (end[:, 0].reshape(n0, -1) for end in ends)
     least, most = (np.clip(end, -1, n0) for end in windows.rows)
     assert np.array_equal(least, first.min(axis=1))

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import touched
 
 from gapcert import Box, Interval, Model
 from gapcert_cells.testing import Band
@@ -74,7 +75,7 @@ def test_windows_of_states_that_do_not_move() -> None:
 
     def width(bound: Any, gap: Any = None) -> np.ndarray:
         added = None if gap is None else disturbance(gap, grid, axes)
-        first, last = windows(bound, grid, axes, added).ends(*pairs)
+        first, last = touched.ends(windows(bound, grid, axes, added), *pairs)
         inside = (first >= 0).all(axis=1) & (last < 8).all(axis=1)
         still = inside & (u == 3)
         assert still.sum() > 100
@@ -100,7 +101,7 @@ def test_a_wrong_claim_loses_successors(monkeypatch: pytest.MonkeyPatch) -> None
         x, which = rng.random((2000, 2)), rng.integers(0, 4, 2000)
         points = np.stack([axes[0][which // 2], axes[1][which % 2]], axis=1)
         cell = np.ravel_multi_index(tuple((x * 8).astype(int).T), grid.counts)
-        first, last = windows(Enclosed(made), grid, axes, None).ends(cell, which)
+        first, last = touched.ends(windows(Enclosed(made), grid, axes, None), cell, which)
         after = np.floor(made.step(x, points).x * 8)
         return int(((after < first) | (after > last)).any(axis=1).sum())
 

@@ -10,12 +10,16 @@ import pytest
 from gapcert import Box, Interval, Model, registry
 from gapcert_equations.config import EquationsConfig
 from gapcert_symbolic.cells.abstraction import windows
-from gapcert_symbolic.cells.bounds import Enclosed, Grown
-from gapcert_symbolic.cells.grid import Grid, corners
-from gapcert_symbolic.cells.structure import structure
+from gapcert_symbolic.cells.bounds import Enclosed, Grown, structure
+from gapcert_symbolic.cells.grid import Grid, combined
 from gapcert_symbolic.solvers import affine
 
 INPUTS = np.linspace(-1.0, 1.0, 5), np.linspace(-0.5, 0.5, 3)
+
+
+def trusted(model: Model) -> Grown:
+    """A bound in floating point."""
+    return Grown(model, model, np.zeros(len(model.states)))
 
 
 def made(**section: Any) -> Model:
@@ -48,7 +52,7 @@ def test_slopes_of_the_car() -> None:
 def test_slopes_of_an_affine_map_are_its_matrix() -> None:
     model = made(states={"p": "m", "q": "m"}, next={"p": "p + q/4 + 2*v*tau", "q": "q/2 - 0*p"})
     assert np.allclose(np.asarray(model.constant_slopes()), [[1, 0.25, 2, 0], [0, 0.5, 0, 0]], atol=1e-15)
-    parts = structure(model, grid(model), INPUTS, rounded=True)
+    parts = structure(trusted(model), grid(model), INPUTS)
     assert [(p.on, p.moves, p.inputs) for p in parts] == [((1,), True, (True, False)), ((1,), False, (False, False))]
 
 
@@ -59,7 +63,7 @@ def test_slopes_at_an_input() -> None:
     assert np.allclose(np.asarray(model.constant_slopes(np.array([3.0, 0.25])))[:, :2], [[1, 0.25], [0, 0.5]], atol=1e-15)
     radius = made(states={"p": "m", "q": "m"}, next={"p": "p + q*abs(s)", "q": "q/2"})
     cells, axes = grid(model), (np.linspace(-0.2, 0.2, 3), np.linspace(-0.1, 0.1, 3))
-    bound, points = Grown(model, radius, cells.widths * 1e-10), corners(list(axes), list(axes))[0]
+    bound, points = Grown(model, radius, cells.widths * 1e-10), combined(axes)
     slope = affine.known(bound, points)
     assert slope is not None
     assert slope.contains(np.array([[[1, s], [0, 0.5]] for _, s in points])).all()
@@ -89,13 +93,13 @@ def test_slopes_are_kept_with_the_model(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_the_same_is_told_by_slopes_as_by_enclosures(monkeypatch: pytest.MonkeyPatch) -> None:
     model = car()
-    told = structure(model, grid(model), INPUTS, rounded=True)
+    told = structure(trusted(model), grid(model), INPUTS)
     with monkeypatch.context() as patch:
         patch.setattr(type(model), "jacobian_enclosure", None)
-        assert structure(model, grid(model), INPUTS, rounded=True) == told
+        assert structure(trusted(model), grid(model), INPUTS) == told
     # Bounds that are rounded outwards rest on slopes that are.
     monkeypatch.setattr(type(model), "constant_slopes", None)
-    looked = structure(model, grid(model), INPUTS)
+    looked = structure(Enclosed(model), grid(model), INPUTS)
     assert [(p.on, p.moves, p.inputs) for p in looked] == [(p.on, p.moves, p.inputs) for p in told]
     assert [p.on for p in told] == [(2,), (2,), ()]
 

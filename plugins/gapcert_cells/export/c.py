@@ -11,9 +11,8 @@ import numpy.typing as npt
 
 from gapcert.plugin import UsageError, harmless, write_atomic
 from gapcert_cells.automaton_controller import AutomatonController
-from gapcert_cells.input_choice import efforts
+from gapcert_cells.grid_controller import efforts
 
-from . import c_memory
 from .parts import Exported, cells_of, ends_of, memory_tables, parts_of, winning_of
 
 LARGEST = 30_000_000
@@ -177,6 +176,86 @@ int controller_act(const double x[CONTROLLER_STATES], {given}int policy, double 
 }}
 """
 
+MEMORY_HEADER = """\
+/* The controller has a memory, a number that the caller keeps, and reads every state of a run once:
+
+     int memory;
+     controller_init(&memory);
+     each period:  code = controller_step(x, CONTROLLER_FIRST, &memory, u);
+
+   The goal is reached, and the promise ends, where controller_done(memory). */
+#define CONTROLLER_MEMORIES {memories}
+
+/* Before a run has begun. */
+void controller_init(int *memory);
+
+/* The memory reads x; CONTROLLER_OUTSIDE where the goal is lost, and the memory is as it was then. */
+int controller_advance(const double x[CONTROLLER_STATES], int *memory);
+
+/* controller_advance and controller_act in one; where there is no input, the memory is as it was. */
+int controller_step(const double x[CONTROLLER_STATES], int policy, int *memory, double u[CONTROLLER_INPUTS]);
+
+/* 1 where the goal is reached. */
+int controller_done(int memory);
+
+"""
+
+MEMORY_SOURCE = """
+/* a times b, rounded before anything is added to it. */
+static double times(double a, double b) {
+  volatile double product = a * b;
+  return product;
+}
+
+static int in_shape(const double x[CONTROLLER_STATES], int k) {
+  double y[CONTROLLER_STATES], d[CONTROLLER_STATES];
+  volatile double total;
+  int i, j;
+  for (j = 0; j < CONTROLLER_STATES; j++) {
+    y[j] = is_angle[j] ? turned(x[j], shape_box[k][j][0], shape_box[k][j][1], shape_box[k][j][2]) : x[j];
+    if (!(y[j] >= shape_box[k][j][0] && y[j] <= shape_box[k][j][1])) return 0;
+    d[j] = y[j] - shape_centres[k][j];
+  }
+  for (i = 0; i < CUTS; i++) {
+    if (cut_of[i] != k) continue;
+    total = 0.0;
+    for (j = 0; j < CONTROLLER_STATES; j++) total = total + times(cuts[i][j], y[j]);
+    if (!(total <= bounds[i])) return 0;
+  }
+  total = 0.0;
+  for (i = 0; i < TERMS; i++) {
+    if (term_of[i] == k) total = total + times(times(d[terms[i][0]], d[terms[i][1]]), factors[i]);
+  }
+  return total <= 1.0;
+}
+
+void controller_init(int *memory) { *memory = MEMORY_START; }
+
+int controller_done(int memory) { return memory >= 0 && memory < CONTROLLER_MEMORIES && is_done[memory]; }
+
+int controller_advance(const double x[CONTROLLER_STATES], int *memory) {
+  size_t cell;
+  int k, letter = 0, next;
+  if (*memory < 0 || *memory >= CONTROLLER_MEMORIES) return CONTROLLER_OUTSIDE;
+  for (k = 0; k < SHAPES; k++) {
+    if (in_shape(x, k)) letter |= 1 << shape_region[k];
+  }
+  /* What was proved of the whole cell counts, should a point on a border be told otherwise by rounding. */
+  if (grid_cell(x, &cell) == CONTROLLER_OK) letter = (letter | must[cell]) & may[cell];
+  next = after[*memory][letter];
+  if (next < 0) return CONTROLLER_OUTSIDE;
+  *memory = next;
+  return CONTROLLER_OK;
+}
+
+int controller_step(const double x[CONTROLLER_STATES], int policy, int *memory, double u[CONTROLLER_INPUTS]) {
+  int then = *memory, code = controller_advance(x, &then);
+  if (code == CONTROLLER_OK) code = controller_act(x, then, policy, u);
+  if (code == CONTROLLER_OK) *memory = then;
+  return code;
+}
+"""
+
 
 def write_c(controller: Exported, out: Path) -> list[Path]:
     """`controller.h` and `controller.c`."""
@@ -186,24 +265,20 @@ def write_c(controller: Exported, out: Path) -> list[Path]:
     numbers = len(one.values) * (2 * (len(parts) + memory) + (one.splits is not None)) + sets.size
     if numbers > LARGEST:
         raise UsageError(f"export: C tables of {numbers:,} numbers (limit {LARGEST:,}); use --to numpy, or fewer cells")
-    words = {
-        "given": "int memory, " if memory else "",
-        "passed": "memory, " if memory else "",
-        "moved": MOVED if memory else "",
-    }
+    words = {"given": "int memory, ", "passed": "memory, ", "moved": MOVED} if memory else dict.fromkeys(WORDS, "")
     counts = {"nx": len(stay.axes), "nu": one.points.shape[1], "points": len(one.points), "cells": cells_of(controller)}
     # Names of a stranger's controller stand in a comment, which they must not end.
     told = ", ".join(f"{a.name} [{a.unit or '1'}]" for a in stay.axes).replace("*/", "* /").replace("/*", "/ *")
     names = {"states": harmless(" ".join(told.replace("\\", "/").split())), "digest": controller.digest()}
     counts |= {"winning": winning_of(controller)}
-    declared = c_memory.DECLARED.format(memories=len(parts)) if memory else ""
+    declared = MEMORY_HEADER.format(memories=len(parts)) if memory else ""
     header = HEADER.format(**counts, **names, **words, memory=declared)
     held = 0 if one.held is None else len(one.held.axes)
     sizes = {"axes": len(one.edges), "nheld": held, "width": one.bits.shape[1], "turn": repr(2 * np.pi)}
     sizes["halvings"] = 0 if one.splits is None else one.splits.levels
     source = SOURCE.format(**sizes, **words, tables="\n".join(_tables(controller, sets, which.ravel())))
     files = [out / "controller.h", out / "controller.c"]
-    for file, text in zip(files, (header, source + (c_memory.SOURCE if memory else "")), strict=True):
+    for file, text in zip(files, (header, source + (MEMORY_SOURCE if memory else "")), strict=True):
         write_atomic(file, text.encode())
     return files
 

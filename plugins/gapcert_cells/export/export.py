@@ -6,14 +6,44 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gapcert.plugin import Answer, Arguments, Controller, UsageError
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.plugin import Answer, Arguments, Controller, UsageError, npz_bytes, write_atomic
 from gapcert_cells.automaton_controller import AutomatonController
-from gapcert_cells.grid_controller import GridController
+from gapcert_cells.grid_controller import GridController, efforts
 from gapcert_cells.load import load_controller
 
+from . import standalone
 from .c import write_c
-from .numpy import write_numpy
-from .parts import Exported, cells_of, parts_of, winning_of
+from .parts import Exported, cells_of, memory_tables, parts_of, winning_of
+
+
+def write_numpy(controller: Exported, out: Path) -> list[Path]:
+    """`controller.py` and `controller.npz`."""
+    parts, stay = parts_of(controller), controller.goal.stay
+    one = parts[0]
+    tables: dict[str, npt.NDArray[Any]] = {f"edges{j}": e for j, e in enumerate(one.edges)}
+    tables |= {
+        "points": one.points,
+        "efforts": efforts(one.points),
+        "held": np.empty((2, 0)) if one.held is None else np.array([one.held.low, one.held.high]),
+        "stay": np.array([stay.low, stay.high]),
+        "bits": np.stack([part.bits for part in parts]),
+        "values": np.stack([part.values for part in parts]),
+        "on": np.array(one.on),
+        "angle": np.array([a.kind == "angle" for a in stay.axes]),
+        "states": np.array(stay.names),
+        "digest": np.array(controller.digest()),
+    }
+    tables |= memory_tables(controller) if isinstance(controller, AutomatonController) else {}
+    if one.splits is not None:
+        tables |= {"splits": one.splits.first, "halvings": np.array(one.splits.levels)}
+    program, data = out / "controller.py", out / "controller.npz"
+    write_atomic(program, Path(standalone.__file__).read_bytes())
+    write_atomic(data, npz_bytes(tables, compress=True))
+    return [program, data]
+
 
 FORMS: dict[str, Callable[[Exported, Path], list[Path]]] = {"c": write_c, "numpy": write_numpy}
 

@@ -43,31 +43,23 @@ def _shapes(goal: Goal) -> dict[str, Table]:
 
     d = x − `centres`. Each cut and each term of a sum belongs to one shape; a shape without terms is no ellipsoid.
     """
-    boxes: list[list[list[float]]] = []
-    centres: list[Table] = []
-    of: list[int] = []
-    n = len(goal.stay.axes)
-    cuts: list[tuple[int, npt.NDArray[np.float64], float]] = []
-    terms: list[tuple[int, int, int, float]] = []
-    for p, region in enumerate(goal.regions):
-        for shape in (*region.boxes, *region.shapes):
-            k, centre = len(of), np.zeros(n)
-            boxes.append(ends_of(shape if isinstance(shape, Box) else shape.box))
-            if isinstance(shape, Polytope):
-                cuts += [(k, a, b) for a, b in zip(shape.zone.matrix, shape.zone.bounds, strict=True)]
-            elif isinstance(shape, Ellipsoid):
-                centre[list(shape.on)], m = shape.centre, shape.matrix
-                pairs = itertools.combinations_with_replacement(range(len(shape.on)), 2)
-                terms += [(k, shape.on[i], shape.on[j], m[i][j] * (1 if i == j else 2)) for i, j in pairs if m[i][j]]
-            of.append(p)
-            centres.append(centre)
+    shapes = [(p, shape) for p, region in enumerate(goal.regions) for shape in (*region.boxes, *region.shapes)]
+    centres, cuts, terms = np.zeros((len(shapes), len(goal.stay.axes))), list[Any](), list[Any]()
+    for k, (_, shape) in enumerate(shapes):
+        if isinstance(shape, Polytope):
+            cuts += [(k, a, b) for a, b in zip(shape.zone.matrix, shape.zone.bounds, strict=True)]
+        elif isinstance(shape, Ellipsoid):
+            centres[k, shape.on], m = shape.centre, shape.matrix
+            pairs = itertools.combinations_with_replacement(range(len(shape.on)), 2)
+            terms += [(k, shape.on[i], shape.on[j], m[i][j] * (1 if i == j else 2)) for i, j in pairs if m[i][j]]
     rows = np.array([t[:3] for t in terms], dtype=np.int64).reshape(-1, 3)
+    ends = [ends_of(shape if isinstance(shape, Box) else shape.box) for _, shape in shapes]
     return {
-        "region": np.array(of, dtype=np.int64),
-        "box": np.array(boxes, dtype=np.float64).reshape(-1, n, 3),
-        "centres": np.array(centres, dtype=np.float64).reshape(-1, n),
+        "region": np.array([p for p, _ in shapes], dtype=np.int64),
+        "box": np.array(ends, dtype=np.float64).reshape(*centres.shape, 3),
+        "centres": centres,
         "cut_of": np.array([c[0] for c in cuts], dtype=np.int64),
-        "cuts": np.array([c[1] for c in cuts], dtype=np.float64).reshape(-1, n),
+        "cuts": np.array([c[1] for c in cuts], dtype=np.float64).reshape(-1, centres.shape[1]),
         "bounds": np.array([c[2] for c in cuts], dtype=np.float64),
         "term_of": rows[:, 0],
         "terms": rows[:, 1:],

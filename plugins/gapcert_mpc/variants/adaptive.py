@@ -12,8 +12,8 @@ from typing import Any, NamedTuple, final
 import numpy as np
 
 from gapcert.plugin import Array, Bools, Controller, Goal, Interval, Ints, Policy, SynthesisProblem
-from gapcert_cells import write_saved
-from gapcert_mpc.controller import MpcController, loaded
+from gapcert_cells import loaded, write_saved
+from gapcert_mpc.controller import MpcController
 from gapcert_mpc.planning.plans import Memory
 from gapcert_mpc.program.linearise import Nominal
 from gapcert_mpc.saved_models import known, pair

@@ -13,8 +13,8 @@ import numpy as np
 import scipy.linalg
 
 from gapcert.plugin import Array, Bools, Controller, Goal, UsageError
-from gapcert_cells import write_saved
-from gapcert_mpc.controller import MpcController, PlanController, loaded
+from gapcert_cells import loaded, write_saved
+from gapcert_mpc.controller import MpcController, PlanController
 from gapcert_mpc.planning.design import Design
 from gapcert_mpc.planning.plans import Memory
 from gapcert_mpc.task import Task

@@ -14,9 +14,9 @@ import numpy as np
 
 from gapcert import Array, Context, Controller, Domain, Goal, Model, SynthesisProblem, UsageError, load_controller, registry
 from gapcert.plugin import Bools, Ints, Policy, Synthesizer, of_config
-from gapcert_cells import GridController, write_saved
+from gapcert_cells import GridController, loaded, write_saved
 from gapcert_mpc.config import Terminal
-from gapcert_mpc.controller import MpcController, loaded
+from gapcert_mpc.controller import MpcController
 from gapcert_mpc.planning.design import Design, Ends
 from gapcert_mpc.planning.plans import Held, Plan
 from gapcert_mpc.planning.successive import steady

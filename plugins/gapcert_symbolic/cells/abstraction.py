@@ -15,11 +15,9 @@ from gapcert_cells import Along, Successors
 from gapcert_symbolic.kernels.kernels import Bits, Game, Packed, _strides
 from gapcert_symbolic.thresholds import THRESHOLDS
 
-from .bounds import Bound, Grown
+from .bounds import Bound, Nominal, Part, structure
 from .gaps import Disturbance, fitted
-from .grid import Grid, View, corners
-from .nominal import Nominal
-from .structure import Part, structure
+from .grid import Grid, View, combined
 
 EPS = float(np.finfo(np.float64).eps)
 PAIRS = 400_000
@@ -48,14 +46,6 @@ class Windows:
     def successors(self) -> Successors:
         """As controllers have them."""
         return Successors(self.grid.counts, self.grid.wraps, self.axes)
-
-    def ends(self, cell: Ints, which: Ints) -> tuple[Ints, Ints]:
-        """First and last cell of each axis (n, axes), of pairs of a flat cell and an input; −1 and n are outside."""
-        ends = np.stack(self.successors.ends(cell, which))
-        for k, (n, wraps) in enumerate(zip(self.grid.counts, self.grid.wraps, strict=True)):
-            if not wraps:
-                ends[:, :, k] = np.clip(ends[:, :, k], -1, n)
-        return ends[0], ends[1]
 
     @property
     def game(self) -> Game:
@@ -129,8 +119,7 @@ def check_size(grid: Grid, inputs: int, lists: bool) -> None:
     if need > THRESHOLDS.memory:
         raise UsageError(
             f"controller: {grid.size:,} cells × {inputs:,} inputs need {need / 1e9:.1f} GB (limit "
-            f"{THRESHOLDS.memory / 1e9:.0f}); "
-            f"use fewer of either"
+            f"{THRESHOLDS.memory / 1e9:.0f}); use fewer of either"
         )
 
 
@@ -149,8 +138,7 @@ def windows(
     the blocks of the gap. f is asked only where its own axes differ.
     """
     model = bound.model
-    # What rests on a bound in floating point may rest on slopes in it, too.
-    own = structure(model, grid, axes, rounded=isinstance(bound, Grown))
+    own = structure(bound, grid, axes)
     names = [*(model.states[j].name for j in grid.states), *(s.name for s in model.inputs)]
     made = fitted(added, own, grid, axes, grid.size if cell is None else len(cell), names)
     alike: dict[tuple[Any, ...], list[int]] = {}
@@ -207,7 +195,7 @@ def _tables(
         cell = view.flat(start, stop)
         rows, place = grid.rows(one.on, cell)
         if known is None or not np.array_equal(known[0], rows):
-            part = replace(base, grid=View(grid, one.on, rows))
+            part = replace(base, view=View(grid, one.on, rows))
             known = rows, part.over(0, len(rows)), None if base.direct else part.slopes(0, len(rows))
         _, f, slopes = known
         for k, own in asked.own.items():
@@ -243,7 +231,7 @@ def _stay(
     """A state that an input leaves exactly where it is stays in its cell, though a bound on it touches the cells beside."""
     grid = view.whole
     if part.moves or k in part.on:
-        moved = ~kept(bound, corners(list(axes), list(axes))[0], added)[:, grid.states[k]]
+        moved = ~kept(bound, combined(axes), added)[:, grid.states[k]]
         still = np.bincount(column, moved, ends.shape[2]) == 0
         ends[:, :, still] = 0 if part.moves else np.unravel_index(view.flat(0, view.size), grid.counts)[k][:, None]
 

@@ -13,8 +13,8 @@ from gapcert import Array, GapFunction, Interval
 from gapcert.plugin import Ints
 from gapcert_symbolic.thresholds import THRESHOLDS
 
-from .grid import Blocks, Grid, corners, flat, share
-from .structure import Part
+from .bounds import Part
+from .grid import Blocks, Grid, combined, flat, share
 
 
 @final
@@ -57,7 +57,8 @@ def disturbance(
     One block is enough along axes on which the gap changes by less than `shared_change` cells. Along others blocks are the
     narrower the more it changes there, as points tell.
     """
-    states, nx, nz = grid.states, gap_states(grid), gap_states(grid) + len(axes)
+    states, nx = grid.states, len(grid.hull[0])
+    nz = nx + len(axes)
     ends = _ends(grid, axes)
     held = [j for j in range(nx) if j not in states]
     order = [*states, *range(nx, nz), *held]
@@ -67,7 +68,7 @@ def disturbance(
     blocks = [Blocks.cut(len(ends[j][0]), b) for j, b in zip(order, sizes, strict=True)]
     parts_of = [(ends[j][0][b.starts[:-1]], ends[j][1][b.starts[1:] - 1]) for j, b in zip(order, blocks, strict=True)]
     low, high = np.empty((2, int(np.prod(sizes)), nz))
-    low[:, order], high[:, order] = corners([e[0] for e in parts_of], [e[1] for e in parts_of])
+    low[:, order], high[:, order] = (combined(e) for e in zip(*parts_of, strict=True))
     parts = []
     for k in range(0, len(low), 4096):
         parts.append(gap.interval_over(Interval(low[k : k + 4096], high[k : k + 4096])))
@@ -78,18 +79,12 @@ def disturbance(
     return Disturbance(Interval(r.lo.min(axis=2), r.hi.max(axis=2)), tuple(blocks[:n]), tuple(blocks[n : n + m]))
 
 
-def gap_states(grid: Grid) -> int:
-    """How many states the model has."""
-    return len(grid.counts) if grid.frame is None else len(grid.frame)
-
-
 def _ends(grid: Grid, axes: tuple[Array, ...]) -> list[tuple[Array, Array]]:
     """Per state and input, lower and upper ends of the pieces that may be put into blocks."""
     cells = dict(zip(grid.states, grid.ends, strict=True))
-    for j in range(gap_states(grid)):
+    for j, (low, high) in enumerate(zip(*grid.hull, strict=True)):
         if j not in cells:
-            assert grid.frame is not None
-            pieces = np.linspace(grid.frame[j, 0], grid.frame[j, 1], THRESHOLDS.held_pieces + 1)
+            pieces = np.linspace(low, high, THRESHOLDS.held_pieces + 1)
             cells[j] = pieces[:-1], pieces[1:]
     return [cells[j] for j in sorted(cells)] + [(a, a) for a in axes]
 
@@ -113,10 +108,8 @@ def _weights(gap: GapFunction, grid: Grid, ends: list[tuple[Array, Array]]) -> A
     a, b = (hull.lo + (hull.hi - hull.lo) * rng.random((THRESHOLDS.gap_pairs, nz)) for _ in range(2))
     moved = np.repeat(a[None], nz + 1, axis=0)
     moved[range(nz), :, range(nz)] = b.T
-    band = (
-        np.stack(gap.interval(moved.reshape(-1, nz))).reshape(2, nz + 1, THRESHOLDS.gap_pairs, -1)[..., list(grid.states)]
-        / grid.widths
-    )
+    band = np.stack(gap.interval(moved.reshape(-1, nz))).reshape(2, nz + 1, THRESHOLDS.gap_pairs, -1)
+    band = band[..., list(grid.states)] / grid.widths
     with np.errstate(invalid="ignore"):
         change = np.nan_to_num(np.abs(band[:, :nz] - band[:, nz:]), nan=0.0, posinf=1e3).max(axis=(0, 3)).mean(axis=1)
     return np.asarray(np.maximum(change, THRESHOLDS.faint_weight * change.max()) if change.max() > 0 else np.ones(nz))

@@ -6,16 +6,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
-from typing import final
+from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Array, Box, UsageError
-from gapcert.plugin import Bools, Ints
+from gapcert import Array, Box, Region, UsageError
+from gapcert.plugin import TURN, Bools, Ints
 
 Small = npt.NDArray[np.int32]
-TURN = 2 * np.pi
+CHUNK = 200_000
 
 
 @final
@@ -125,22 +125,43 @@ class Grid:
         whole[0][:, self.states], whole[1][:, self.states] = low, high
         return whole[0], whole[1]
 
-    def touching(self, box: Box, cell: Ints | None = None) -> Bools:
-        """(cells,): the closed cell meets the closed box (over-approximates: for obstacles); of all cells, or of some."""
-        return self._product([self._axis(k, box, outer=True) for k in range(len(self.counts))], cell)
+    def touching(self, region: Region | None, cell: Ints | None = None) -> Bools:
+        """(cells,): the closed cell may have a point in the region (over-approximates: for obstacles); of all, or of some.
 
-    def inside(self, box: Box, cell: Ints | None = None) -> Bools:
-        """(cells,): the closed cell is a subset of the box (under-approximates: for targets); of all cells, or of some."""
-        return self._product([self._axis(k, box, outer=False) for k in range(len(self.counts))], cell)
+        None is no region, and nothing is in it.
+        """
+        return self._related(region, cell, outer=True)
+
+    def inside(self, region: Region | None, cell: Ints | None = None) -> Bools:
+        """(cells,): the closed cell lies wholly in one part of the region (under-approximates: for targets), whatever the
+        states without cells are; of all, or of some.
+        """
+        return self._related(region, cell, outer=False)
+
+    def _related(self, region: Region | None, cell: Ints | None, outer: bool) -> Bools:
+        found = np.zeros(self.size if cell is None else len(cell), dtype=bool)
+        for box in region.boxes if region else ():
+            found |= self._product([self._axis(k, box, outer) for k in range(len(self.counts))], cell)
+        for shape in region.shapes if region else ():
+            asked = shape.touches if outer else shape.covers
+            for start in range(0, len(found), CHUNK):
+                low, high = self.cells(start, start + CHUNK) if cell is None else self.boxes(cell[start : start + CHUNK])
+                low[:, self.states] -= self._rounded
+                high[:, self.states] += self._rounded
+                found[start : start + CHUNK] |= asked(low, high)
+        return found
+
+    @property
+    def _rounded(self) -> Array:
+        """Where nodes come first, an edge is a node and half a width, rounded."""
+        return 0.0 * self.widths if self.nodes is None else 1e-10 * self.widths
 
     def _axis(self, k: int, box: Box, outer: bool) -> Bools:
-        (lower, upper), found = self.ends[k], np.zeros(self.counts[k], dtype=bool)
+        (lower, upper), found, j = self.ends[k], np.zeros(self.counts[k], dtype=bool), self.states[k]
         for turns in self._turns(k, box):
             # Moving by a turn rounds; the pad keeps obstacles too large and targets too small.
-            pad = 4 * np.spacing(TURN) * abs(turns) * (1 if outer else -1)
-            if self.nodes is not None and outer:
-                pad += 1e-10 * self.widths[k]  # an edge is a node and half a width, rounded
-            low, high = box.low[k] + turns * TURN - pad, box.high[k] + turns * TURN + pad
+            pad = 4 * np.spacing(TURN) * abs(turns) * (1 if outer else -1) + (self._rounded[k] if outer else 0.0)
+            low, high = box.low[j] + turns * TURN - pad, box.high[j] + turns * TURN + pad
             if outer:
                 found |= (lower <= high) & (upper >= low)
             else:
@@ -149,9 +170,10 @@ class Grid:
 
     def _turns(self, k: int, box: Box) -> range:
         """By how many turns the box can be moved so that it may meet the grid, and one more on either side."""
-        if box.axes[k].kind != "angle":
+        j = self.states[k]
+        if box.axes[j].kind != "angle":
             return range(1)
-        first, last = (self.box.low[k] - box.high[k]) / TURN, (self.box.high[k] - box.low[k]) / TURN
+        first, last = (self.box.low[k] - box.high[j]) / TURN, (self.box.high[k] - box.low[j]) / TURN
         return range(int(np.floor(first)) - 1, int(np.ceil(last)) + 2)
 
     def _product(self, masks: list[Bools], cell: Ints | None) -> Bools:
@@ -174,14 +196,6 @@ class View:
     whole: Grid
     axes: tuple[int, ...]
     rows: Ints | None = None
-
-    @property
-    def states(self) -> tuple[int, ...]:
-        return self.whole.states
-
-    @property
-    def widths(self) -> Array:
-        return self.whole.widths
 
     @property
     def size(self) -> int:
@@ -219,14 +233,12 @@ class Blocks:
 
 def flat(blocks: list[Blocks]) -> Ints:
     """The flat block of every item of the product of the axes, in C order."""
-    index = np.meshgrid(*(b.of for b in blocks), indexing="ij")
-    return np.asarray(np.ravel_multi_index([i.ravel() for i in index], [len(b) for b in blocks]))
+    return np.asarray(np.ravel_multi_index(tuple(combined([b.of for b in blocks]).T), [len(b) for b in blocks]))
 
 
-def corners(low: list[Array], high: list[Array]) -> tuple[Array, Array]:
-    """Lower and upper corners (n, axes) of the product of intervals given per axis, in C order."""
-    lo, hi = (np.meshgrid(*ends, indexing="ij") for ends in (low, high))
-    return np.stack([m.ravel() for m in lo], axis=-1), np.stack([m.ravel() for m in hi], axis=-1)
+def combined(axes: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:
+    """(n, axes): every combination of values that are given per axis, in C order."""
+    return np.stack([m.ravel() for m in np.meshgrid(*axes, indexing="ij")], axis=-1)
 
 
 def share(counts: tuple[int, ...], budget: int, weights: Sequence[float] | None = None) -> tuple[int, ...]:

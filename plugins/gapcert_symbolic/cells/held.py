@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
@@ -11,7 +11,7 @@ from gapcert import Array, Box, Domain, GapFunction, Goal, Interval, Model, Usag
 from gapcert.plugin import Bools, Ints, supremum
 from gapcert_symbolic.thresholds import THRESHOLDS
 
-from .grid import Grid, corners
+from .grid import Grid, combined
 
 CHUNK = 20_000
 
@@ -54,9 +54,8 @@ class Left:
         z, domain = self.box(v), self.domain
         low, high = np.maximum(z.lo[0], domain.low), np.minimum(z.hi[0], domain.high)
         x = Box(domain.states.axes, tuple(low[: domain.nx].tolist()), tuple(high[: domain.nx].tolist()))
-        return supremum(
-            self.gap, Domain(x, self.inputs, domain.relations), THRESHOLDS.held_tolerance, THRESHOLDS.held_boxes, self.states
-        )[0]
+        part = Domain(x, self.inputs, domain.relations)
+        return supremum(self.gap, part, THRESHOLDS.held_tolerance, THRESHOLDS.held_boxes, self.states)[0]
 
     def broken(self, v: Interval) -> str:
         """What fails for some v in V and some input: a relation that does not involve the cells' states, or the range of v."""
@@ -75,7 +74,7 @@ class Left:
         low, high = np.asarray(self.inputs.low), np.asarray(self.inputs.high)
         middle, reach = (low + high) / 2, share * (high - low) / 2
         inputs = Box(self.inputs.axes, tuple((middle - reach).tolist()), tuple((middle + reach).tolist()))
-        return Left(self.model, self.gap, self.domain, self.goal, self.on, inputs)
+        return replace(self, inputs=inputs)
 
 
 def invariant(left: Left) -> Box:
@@ -174,7 +173,7 @@ def offered(domain: Domain, grid: Grid, axes: tuple[Array, ...], cell: Ints | No
     """
     if not domain.relations:
         return None
-    points, nx = corners(list(axes), list(axes))[0], domain.nx
+    points, nx = combined(axes), domain.nx
     size = grid.size if cell is None else len(cell)
     out = np.ones((size, len(points)), dtype=bool)
     for relation in domain.relations:

@@ -13,16 +13,15 @@ from typing import Any, Protocol, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Goal, Region
+from gapcert import Region
 from gapcert.plugin import Automaton, Bools, Ints
-from gapcert_symbolic.cells import repeats
 from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
-from gapcert_symbolic.kernels import inverse, reach
+from gapcert_symbolic.kernels import reach, repeats
 from gapcert_symbolic.kernels.kernels import whole
 from gapcert_symbolic.solvers.problem import Play, Solution
 
-from .games import inside, leading, touching
+from .games import leading
 
 
 @final
@@ -38,9 +37,9 @@ class Labels:
         """Of all cells, or of some."""
         must, may = np.zeros((2, grid.size if cell is None else len(cell)), dtype=np.int64)
         for p, region in enumerate(regions):
-            within = inside(grid, region, cell)
+            within = grid.inside(region, cell)
             must |= within.astype(np.int64) << p
-            may |= (touching(grid, region, cell) | within).astype(np.int64) << p
+            may |= (grid.touching(region, cell) | within).astype(np.int64) << p
         return cls(must, may)
 
     def followed_by(self, other: Labels) -> Labels:
@@ -118,14 +117,6 @@ def missed(leads: Bools, kind: Ints, safe: Bools) -> npt.NDArray[np.int16]:
     return missing
 
 
-def unlabelled(goal: Goal, labels: Labels | None) -> str:
-    """Which region no cell lies wholly inside, or nothing."""
-    if goal.automaton is None or labels is None:
-        return ""
-    lost = [n for p, n in enumerate(goal.automaton.propositions) if not (labels.must >> p & 1).any()]
-    return f"no cell lies wholly inside region {lost[0]}; use smaller cells, or align it with their edges" if lost else ""
-
-
 @final
 class Watched:
     """`Least`, compiled."""
@@ -142,17 +133,16 @@ class Watched:
         accepting, done = np.array(automaton.accepting), automaton.done
         self.values[:], self.bits[:] = np.where(self.safe, -1, -2), 0
         for q in np.flatnonzero(accepting).tolist():
-            self.bits[q] = self.windows.offered(self.safe) if done[q] else self._again(q, assumed)
+            if done[q]:
+                self.bits[q] = self.windows.offered(self.safe)
+            else:
+                self.bits[q] = leading(self.windows, self.play.entered(q, assumed), self.safe & assumed[q])
             self.values[q] = np.where(self.safe if done[q] else self.bits[q].any(axis=1), 0, -2)
         missing, good = missed(leads, kind, self.safe), np.full(self.values.shape, -1, dtype=np.int32)
         on = reach.Positions(leads, kind, ~accepting, self.values, self.bits, good, missing)
         if self.repeats is None:
             reach.least(self.windows.game, on)
         else:
-            inverse.least(self.repeats, on, self.windows.permitted)
+            repeats.least(self.repeats, on, self.windows.permitted)
         np.maximum(self.values, -1, out=self.values)
         return int(self.values.max(initial=0))
-
-    def _again(self, q: int, assumed: Bools) -> Any:
-        """Inputs that lead from an accepting state to what is assumed."""
-        return leading(self.windows, self.play.entered(q, assumed), self.safe & assumed[q])

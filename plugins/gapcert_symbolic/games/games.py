@@ -1,23 +1,55 @@
-"""Goals beyond reach-avoid and invariance, solved with the two."""
+"""Games on cells: which solver answers one, and goals beyond reach-avoid and invariance, solved with the two."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
-from gapcert import Box, Region
-from gapcert.plugin import Bools, Ints
+from gapcert.plugin import Bools
 from gapcert_symbolic.cells.abstraction import Windows
-from gapcert_symbolic.cells.grid import Grid
-from gapcert_symbolic.kernels.kernels import Bits
-from gapcert_symbolic.solvers import runs
+from gapcert_symbolic.kernels import reach, repeats
+from gapcert_symbolic.kernels.kernels import Bits, whole
+from gapcert_symbolic.solvers import affine, erosion, lazy, runs
 from gapcert_symbolic.solvers.problem import Problem, Solution
-from gapcert_symbolic.solvers.solvers import solve
+from gapcert_symbolic.thresholds import THRESHOLDS
 
-CHUNK = 200_000
+
+def usable(asked: int | None, pairs: int) -> int:
+    """How many threads are used for so many pairs of a cell and an input: as asked, else one per core from `threaded_pairs`
+    on."""
+    return asked or (len(os.sched_getaffinity(0)) if pairs >= THRESHOLDS.threaded_pairs else 1)
+
+
+def solve(problem: Problem) -> Solution:
+    """On JAX where that is asked for; steps to a target; or what the first of SOLVERS finds that suits the problem."""
+    if problem.solver == "jax":
+        from gapcert_symbolic.solvers import dense
+
+        return dense.solve(problem)
+    if problem.target is not None:
+        return _reach(problem, problem.target)
+    return next(found for solver in SOLVERS if (found := solver(problem)) is not None)
+
+
+SOLVERS: tuple[Callable[[Problem], Solution | None], ...] = (affine.solve, lazy.solve, erosion.solve, runs.solve)
+"""Of invariance; None where a problem does not suit one. In closed form; by blocks of cells; else on tables of windows, the
+special one first."""
+
+
+def _reach(problem: Problem, target: Bools) -> Solution:
+    """Where windows repeat, by what is watched at a cell, whatever the cell is; else each pair of a cell and an input is
+    watched at one.
+    """
+    windows, fresh = problem.windows(), target & problem.safe
+    values, bits = np.where(fresh, 0, np.where(problem.safe, -1, -2)).astype(np.int32), windows.offered(fresh)
+    if (given := repeats.inverse(windows, whole(windows.grid.size * windows.inputs))) is None:
+        reach.reach(windows.game, values, bits)
+    else:
+        repeats.reach(given, values, bits, windows.permitted, problem.threads)
+    return Solution(np.maximum(values, -1), bits, int(values.max(initial=0)))
 
 
 def leading(windows: Windows, into: Bools, asked: Bools) -> Bits:
@@ -75,39 +107,3 @@ def recurrence(problem: Problem, target: Bools) -> Solution:
         if left.sum() == visits.sum():
             return Solution(way.values, np.where(visits[:, None], again, way.bits), rounds)
         visits = left
-
-
-def inside(grid: Grid, region: Region, cell: Ints | None = None) -> Bools:
-    """(cells,): the cell lies wholly in one part of the region, whatever the states without cells are; of all, or of some."""
-    return _any(grid, region, grid.inside, "covers", cell)
-
-
-def touching(grid: Grid, region: Region, cell: Ints | None = None) -> Bools:
-    """(cells,): the cell may have a point in the region; of all, or of some."""
-    return _any(grid, region, grid.touching, "touches", cell)
-
-
-def _any(grid: Grid, region: Region, of_box: Callable[..., Bools], of_shape: str, cell: Ints | None) -> Bools:
-    found = np.zeros(grid.size if cell is None else len(cell), dtype=bool)
-    for box in region.boxes:
-        found |= of_box(over(box, grid.states), cell)
-    for shape in region.shapes:
-        found |= _each(grid, getattr(shape, of_shape), len(found), cell)
-    return found
-
-
-def over(box: Box, states: tuple[int, ...]) -> Box:
-    """The box over some of its axes."""
-    return Box(tuple(box.axes[j] for j in states), tuple(box.low[j] for j in states), tuple(box.high[j] for j in states))
-
-
-def _each(grid: Grid, asked: Any, size: int, cell: Ints | None) -> Bools:
-    # Where nodes come first, an edge is a node and half a width, rounded.
-    pad = 0.0 if grid.nodes is None else 1e-10 * grid.widths
-    parts = []
-    for start in range(0, size, CHUNK):
-        low, high = grid.cells(start, start + CHUNK) if cell is None else grid.boxes(cell[start : start + CHUNK])
-        low[:, grid.states] -= pad
-        high[:, grid.states] += pad
-        parts.append(asked(low, high))
-    return np.concatenate(parts)

@@ -15,16 +15,14 @@ import numpy.typing as npt
 from gapcert import Array, Interval, UsageError
 from gapcert.plugin import Bools, Ints
 from gapcert_symbolic.cells.abstraction import EPS, kept
-from gapcert_symbolic.cells.bounds import Bound, Grown
+from gapcert_symbolic.cells.bounds import ROUNDING, Bound, Grown
 from gapcert_symbolic.cells.gaps import Disturbance
-from gapcert_symbolic.cells.grid import Grid, corners
-from gapcert_symbolic.cells.structure import ROUNDING
-from gapcert_symbolic.kernels.kernels import _on, compiled, inlined
+from gapcert_symbolic.cells.grid import Grid, combined
+from gapcert_symbolic.kernels.kernels import Bits, _on, compiled, inlined
 from gapcert_symbolic.thresholds import THRESHOLDS
 
 from .problem import Problem, Solution
 
-Bits = npt.NDArray[np.uint8]
 Marks = npt.NDArray[np.int8]
 Counts = tuple[int, ...]  # a tuple: loops over axes are unrolled, which halves the time
 PAD = 1e-7  # of a cell, above all rounding of indices
@@ -45,7 +43,7 @@ class Maps(NamedTuple):
 
 def solve(problem: Problem) -> Solution | None:
     """Invariance, where f is affine under each of few inputs."""
-    if problem.target is not None or problem.dynamics is None or (found := maps(*problem.dynamics)) is None:
+    if problem.dynamics is None or (found := maps(*problem.dynamics)) is None:
         return None
     return Solution(*invariance(found, problem.dynamics.grid, problem.safe), 1)
 
@@ -54,7 +52,7 @@ def maps(bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance |
     """None where f is not known to be affine, up to `axis_leak` cells over the grid, with slopes that can be inverted; or where
     inputs are many, the gap differs between cells, or tables are small.
     """
-    points, n = corners(list(axes), list(axes))[0], len(grid.counts)
+    points, n = combined(axes), len(grid.counts)
     if len(points) > THRESHOLDS.affine_inputs or any(grid.wraps) or grid.frame is not None or allowed is not None:
         return None
     if added is not None and added.r.lo.shape[:2] != (1, 1):

@@ -8,32 +8,22 @@ table goes around twice. Values and inputs are those of the compiled solvers.
 from __future__ import annotations
 
 import functools
-import importlib.util
 import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from gapcert import MissingDependency
 from gapcert.plugin import Bools
 from gapcert_symbolic.cells.abstraction import Windows
 
 from .problem import Play, Problem, Solution
 
 
-def check() -> None:
-    """MissingDependency without JAX."""
-    if importlib.util.find_spec("jax") is None:
-        raise MissingDependency(
-            "controller.solver: jax needs jax, which is not installed; run: pip install 'gapcert[jax]', or leave solver out"
-        )
-
-
-def solve(problem: Problem) -> Solution | None:
-    """Either game, where the option asks for it."""
-    if problem.solver != "jax":
-        return None
+def solve(problem: Problem) -> Solution:
+    """Either game."""
     windows, safe, target = problem.windows(), problem.safe, problem.target
     return _invariance(windows, safe) if target is None else _reach_avoid(windows, safe, target)
 
@@ -104,31 +94,27 @@ class _Game:
     """Windows on the device. Cells are arrays of the shape `counts`; inputs have one more axis before: eight to a byte."""
 
     def __init__(self, windows: Windows) -> None:
-        import jax.numpy as jnp
-
         grid, m = windows.grid, windows.inputs
         self.windows, self.bytes = windows, (m + 7) // 8
         shapes = [tuple(grid.counts[d] if d in axis.on else 1 for d in range(len(grid.counts))) for axis in windows.axes]
         # The last byte is filled up with the last input, and what is told of the filling is left out.
         column = np.stack([np.pad(axis.column, (0, -m % 8), mode="edge") for axis in windows.axes])
-        self.column = jnp.asarray(column.reshape(len(shapes), self.bytes, 8).astype(np.int32))
-        self.tables = [
+        tables = [
             [jnp.asarray(np.ascontiguousarray(end.T).reshape(end.shape[1], *shape)) for end in (axis.first, axis.last)]
             for axis, shape in zip(windows.axes, shapes, strict=True)
         ]
         self.allowed = self._shaped(windows.every)
-        self._kept, self._grown = _compiled(grid.counts, grid.wraps, tuple(axis.moves for axis in windows.axes))
+        kept, grown = _compiled(grid.counts, grid.wraps, tuple(axis.moves for axis in windows.axes))
+        columns = jnp.asarray(column.reshape(len(shapes), self.bytes, 8).astype(np.int32))
+        given = {"column": columns, "tables": tables, "allowed": self.allowed}
+        self.kept, self.grown = functools.partial(kept, **given), functools.partial(grown, **given)
 
     def _shaped(self, packed: Any) -> Any:
         """(…, bytes) → (bytes, *counts), or (bytes, 1, …) where all cells have the same."""
-        import jax.numpy as jnp
-
         counts = self.windows.grid.counts
         return jnp.asarray(packed.T.reshape(self.bytes, *(counts if len(packed) > 1 else [1] * len(counts))))
 
     def cells(self, marked: Any) -> Any:
-        import jax.numpy as jnp
-
         return jnp.asarray(marked.reshape(self.windows.grid.counts))
 
     def flat(self, cells: Any) -> Any:
@@ -139,22 +125,12 @@ class _Game:
 
     def offered(self, marked: Bools) -> Any:
         """All inputs that are allowed, in marked cells."""
-        import jax.numpy as jnp
-
         return jnp.where(self.cells(marked), self.allowed, jnp.uint8(0))
-
-    def kept(self, alive: Any) -> Any:
-        return self._kept(alive, self.column, self.tables, self.allowed)
-
-    def grown(self, won: Any, left: Any, values: Any, inputs: Any, level: int) -> Any:
-        return self._grown(won, left, values, inputs, np.int32(level), self.column, self.tables, self.allowed)
 
 
 @functools.cache
 def _compiled(counts: tuple[int, ...], wraps: tuple[bool, ...], moves: tuple[bool, ...]) -> tuple[Callable[..., Any], ...]:
     """One round of invariance, and one of reach."""
-    import jax
-
     rounds = _Rounds(counts, wraps, moves)
     return jax.jit(rounds.kept), jax.jit(rounds.grown)
 
@@ -168,8 +144,6 @@ class _Rounds(NamedTuple):
 
     def sums(self, lost: Any) -> Any:
         """Prefix sums, with a zero before the first along each axis."""
-        import jax.numpy as jnp
-
         table = lost.astype(jnp.uint32)
         for k in range(len(self.counts)):
             whole = jnp.concatenate([table, table], axis=k) if self.wraps[k] else table
@@ -179,9 +153,6 @@ class _Rounds(NamedTuple):
 
     def valid(self, table: Any, columns: Any, tables: Any) -> Any:
         """(*counts): is the window of the input with these columns in the grid, and nothing in it lost?"""
-        import jax
-        import jax.numpy as jnp
-
         n, inside, ends = len(self.counts), jnp.ones((1,) * len(self.counts), dtype=bool), []
         for k, count in enumerate(self.counts):
             first, last = (jax.lax.dynamic_index_in_dim(t, columns[k], keepdims=False) for t in tables[k])
@@ -203,9 +174,6 @@ class _Rounds(NamedTuple):
 
     def leading(self, won: Any, column: Any, tables: Any, allowed: Any) -> Any:
         """(bytes, *counts): the inputs that lead wholly into `won`."""
-        import jax
-        import jax.numpy as jnp
-
         table = self.sums(~won)
 
         def byte(eight: Any) -> Any:
@@ -218,8 +186,6 @@ class _Rounds(NamedTuple):
 
     def kept(self, alive: Any, column: Any, tables: Any, allowed: Any) -> Any:
         """(what stays alive, its inputs, has anything died?)"""
-        import jax.numpy as jnp
-
         inputs = jnp.where(alive, self.leading(alive, column, tables, allowed), jnp.uint8(0))
         left = (inputs != 0).any(axis=0)
         return left, inputs, (left != alive).any()
@@ -228,8 +194,6 @@ class _Rounds(NamedTuple):
         self, won: Any, left: Any, values: Any, inputs: Any, level: Any, column: Any, tables: Any, allowed: Any
     ) -> tuple[Any, ...]:
         """(won, left, values, inputs, has anything been won?)"""
-        import jax.numpy as jnp
-
         found = self.leading(won, column, tables, allowed)
         fresh = left & (found != 0).any(axis=0)
         return won | fresh, left & ~fresh, jnp.where(fresh, level, values), jnp.where(fresh, found, inputs), fresh.any()

@@ -19,13 +19,12 @@ import numpy.typing as npt
 from gapcert.plugin import Bools, Ints
 from gapcert_cells import Along
 from gapcert_symbolic.cells.abstraction import Windows
-from gapcert_symbolic.kernels.kernels import borrowing, compiled, inlined, part, together
+from gapcert_symbolic.kernels.kernels import Bits, borrowing, compiled, inlined, part, together
 
 from .problem import Problem, Solution
 
 Words = npt.NDArray[np.uint64]
 ALL = np.uint64(2**64 - 1)
-Bits = npt.NDArray[np.uint8]
 Shared = Callable[[Callable[[int, int], None]], None]
 """Calls a function with (begin, end) of parts of all rows, each in a thread."""
 
@@ -52,7 +51,7 @@ def order(windows: Windows) -> tuple[int, ...] | None:
 
 def solve(problem: Problem) -> Solution | None:
     """Invariance, where axes can be eroded one after another."""
-    if problem.target is not None or (found := order(windows := problem.windows())) is None:
+    if (found := order(windows := problem.windows())) is None:
         return None
     alive, bits, rounds = invariance(windows, problem.safe, found, problem.threads)
     return Solution(np.where(alive, 0, -1).astype(np.int32), bits, rounds)

@@ -18,11 +18,9 @@ import numpy as np
 from gapcert import Array, Interval
 from gapcert.plugin import Bools, Ints
 from gapcert_symbolic.cells.abstraction import EPS, size_of, touched
-from gapcert_symbolic.cells.bounds import Bound, Grown
+from gapcert_symbolic.cells.bounds import Bound, Nominal, structure
 from gapcert_symbolic.cells.gaps import Disturbance, fitted
-from gapcert_symbolic.cells.grid import Grid, View, corners
-from gapcert_symbolic.cells.nominal import Nominal
-from gapcert_symbolic.cells.structure import Part, structure
+from gapcert_symbolic.cells.grid import Grid, View, combined
 from gapcert_symbolic.kernels import lazy_kernels as kernels
 from gapcert_symbolic.kernels.kernels import Bits, _strides
 from gapcert_symbolic.kernels.lazy_kernels import Cells, Small, Tree, Watch
@@ -41,12 +39,12 @@ class BlockWindows:
 
     def __init__(self, bound: Bound, grid: Grid, axes: tuple[Array, ...], added: Disturbance | None) -> None:
         self.bound, self.grid, self.states = bound, grid, list(grid.states)
-        self.points = corners(list(axes), list(axes))[0]
+        self.points = combined(axes)
         self.sizes = np.array(_sizes(max(grid.counts)))
         self.spread = bound.spread(np.array([_half(grid, int(size)) for size in self.sizes]), self.points)
         self.still = bound.unmoved(self.points)[:, self.states]
         # As tables have it, with its suprema where it hardly changes.
-        self.added = added = None if added is None else fitted(added, _parts(bound, grid, axes), grid, axes, grid.size).added
+        self.added = added = None if added is None else fitted(added, structure(bound, grid, axes), grid, axes, grid.size).added
         if added is not None:
             self.cell, self.input = added.of(grid, np.arange(grid.size)), added.of_inputs
             self.r = Interval(*(np.ascontiguousarray(end[:, :, self.states]) for end in (added.r.lo, added.r.hi)))
@@ -86,7 +84,7 @@ class BlockWindows:
 
 def solve(problem: Problem) -> Solution | None:
     """Invariance; None where tables are as good, or blocks do not do."""
-    if problem.target is not None or problem.dynamics is None:
+    if problem.dynamics is None:
         return None
     bound, grid, axes, added, allowed = problem.dynamics
     if not suits(bound, grid, axes):
@@ -97,20 +95,15 @@ def solve(problem: Problem) -> Solution | None:
     return found if nested or ask.spread is None else None
 
 
-def _parts(bound: Bound, grid: Grid, axes: tuple[Array, ...]) -> list[Part]:
-    return structure(bound.model, grid, axes, rounded=isinstance(bound, Grown))
-
-
 def suits(bound: Bound, grid: Grid, axes: tuple[Array, ...]) -> bool:
     """Would tables be as long as the grid, with f to be asked for each input on its own?"""
-    if any(part.rows(grid) < grid.size for part in _parts(bound, grid, axes)):
+    if any(part.rows(grid) < grid.size for part in structure(bound, grid, axes)):
         return False
     if not bound.groups:
         return True
     # Where inputs cannot share f in some cells, they cannot in all.
-    some = np.linspace(0, grid.size - 1, min(grid.size, THRESHOLDS.single_pairs // math.prod(len(a) for a in axes) + 1)).astype(
-        np.int64
-    )
+    number = min(grid.size, THRESHOLDS.single_pairs // math.prod(len(a) for a in axes) + 1)
+    some = np.linspace(0, grid.size - 1, number).astype(np.int64)
     return Nominal.coarsest(bound, View(grid, tuple(range(len(grid.counts))), some), axes).direct
 
 

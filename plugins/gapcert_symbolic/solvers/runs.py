@@ -309,10 +309,8 @@ def leading(game: Game, into: Values, asked: Values, bits: Bits) -> None:
     _kept(game, asked, own, sense, bits, rows)
 
 
-def solve(problem: Problem) -> Solution | None:
+def solve(problem: Problem) -> Solution:
     """Invariance, whatever the windows."""
-    if problem.target is not None:
-        return None
     windows, values = problem.windows(), np.where(problem.safe, 0, -1).astype(np.int32)
     bits = windows.no_bits
     return Solution(values, bits, invariance(problem.threads, windows.game, values, bits, *windows.rows))
