@@ -24,8 +24,7 @@ from gapcert.plugin import (
 )
 
 from .bounded_function import Function
-from .lifting import Cones, Part, Side, Table, lift
-from .multilinear_bands import Band
+from .lifting import Band, Cones, Part, Side, Table, lift
 
 Index = npt.NDArray[np.intp]
 
