@@ -1,4 +1,4 @@
-"""Rigid bodies joined in a tree: mass matrix and bias by recursion over the bodies, recorded as straight-line code.
+"""The section `bodies`, rigid bodies joined in a tree: mass matrix and bias by recursion, recorded as straight-line code.
 
 Composite bodies give M, Newton–Euler without accelerations the bias (Featherstone, Rigid Body Dynamics Algorithms, 2008,
 chapters 5 and 6), in 3-vectors of each body's own frame. What is zero or one in the numbers of a robot is no operation.
@@ -7,20 +7,58 @@ chapters 5 and 6), in 3-vectors of each body's own frame. What is zero or one in
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
-from gapcert_equations.programs.tape import Value
+import numpy as np
+
+from gapcert_equations.config import BodyConfig, EquationsConfig
+from gapcert_equations.programs.tape import Recorder, Value
+from gapcert_equations.text import declarations, units
+from gapcert_equations.text.sympy_text import symbol
+from gapcert_equations.text.units import METRE
+
+from .rigid import Read, gravity
 
 _TINY = 1e-300
 Vector = list[Any]
 Matrix = list[Vector]
 
 
+def terms(config: EquationsConfig, recorder: Recorder, read: Read) -> tuple[Matrix, Vector]:
+    """(M, forces − bias) in the order of the coordinates: numbers or Values; `read` turns (path, text) into an expression."""
+    sections = list((config.bodies or {}).items())
+    names, order = list(config.coordinates), [b.joint for _, b in sections if b.joint is not None]
+
+    def number(path: str, text: str) -> Any:
+        return recorder.value(read(path, text))
+
+    def moving() -> tuple[list[_Body], Vector, Matrix, Vector]:
+        tree = [_body(name, b, [n for n, _ in sections], config, number) for name, b in sections]
+        q, v = ([recorder.value(symbol(f"{b.joint}{end}")) if b.joint else 0.0 for _, b in sections] for end in ("", "_dot"))
+        armature = [number(f"bodies.{name}.armature", b.armature) for name, b in sections]
+        return tree, q, *_mechanics(tree, q, v, down, armature)
+
+    falling = gravity(config, read, 3)
+    down = [recorder.value(g) for g in falling]
+    # An effect seldom changes the bodies themselves.
+    tree, q, mass, bias = recorder.once((config.model_dump_json(include={"bodies", "coordinates"}), *falling), moving)
+    still = [0.0] * len(tree)
+    for n, text in config.tilt.items():
+        # As for any mechanical model: what gravity does at rest is taken at q − angle.
+        angle = number(f"tilt.{n}", text)
+        turned = [a - angle if b.joint == n else a for a, (_, b) in zip(q, sections, strict=True)]
+        rest, moved = (_mechanics(tree, at, still, down, still)[1] for at in (q, turned))
+        bias = [b - r + m for b, r, m in zip(bias, rest, moved, strict=True)]
+    place = [order.index(n) for n in names]
+    forces = [number(f"forces.{n}", config.forces.get(n, "0")) for n in names]
+    return [[mass[i][j] for j in place] for i in place], [f - bias[i] for f, i in zip(forces, place, strict=True)]
+
+
 @final
 @dataclass(frozen=True)
-class Body:
+class _Body:
     """A body on its `parent` (index, −1: the world). Its frame is the joint's: at `place` in the parent's frame, turned by
     `turn` (3, 3) when q = 0; `axis` is the joint's unit vector there, `kind` what q does along it: revolute, prismatic, or
     fixed, where there is no q. drag (a, b, c, d) is the force −m v (a + b |v|) on the centre of mass and the torque
@@ -30,19 +68,49 @@ class Body:
     """
 
     parent: int
-    place: Sequence[Any]
-    turn: Sequence[Sequence[float]]
-    axis: Sequence[float]
+    place: Vector
+    turn: Matrix
+    axis: Vector
     kind: str
     mass: Any
-    com: Sequence[Any]
-    inertia: Sequence[Sequence[Any]]
-    drag: Sequence[Any] = (0.0, 0.0, 0.0, 0.0)
+    com: Vector
+    inertia: Matrix
+    drag: Vector
 
 
-def mechanics(
-    bodies: Sequence[Body], q: Sequence[Any], v: Sequence[Any], gravity: Sequence[Any], armature: Sequence[Any]
-) -> tuple[Matrix, Vector]:
+def _body(name: str, b: BodyConfig, earlier: list[str], config: EquationsConfig, number: Callable[[str, str], Any]) -> _Body:
+    at, com = (
+        [number(f"bodies.{name}.{k}.{i}", t) for i, t in enumerate(place)] for k, place in (("at", b.at), ("com", b.com))
+    )
+    xx, yy, zz, xy, xz, yz = (*(number(f"bodies.{name}.inertia.{i}", t) for i, t in enumerate(b.inertia)), 0.0, 0.0, 0.0)[:6]
+    axis = np.array(b.axis) / np.linalg.norm(b.axis)
+    kind = "fixed"
+    if b.joint is not None:
+        straight = units.unit(declarations.axes(config.coordinates)[b.joint].unit)[0] == METRE
+        kind = "prismatic" if straight else "revolute"
+    return _Body(
+        -1 if b.on is None else earlier.index(b.on),
+        at,
+        _of_quaternion(np.array(b.turned) / np.linalg.norm(b.turned)),
+        axis.tolist(),
+        kind,
+        number(f"bodies.{name}.mass", b.mass),
+        com,
+        [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]],
+        [number(f"bodies.{name}.drag.{k}.{i}", t) for k in ("linear", "angular") for i, t in enumerate(getattr(b.drag, k))],
+    )
+
+
+def _of_quaternion(quaternion: Any) -> Matrix:
+    w, (x, y, z) = float(quaternion[0]), quaternion[1:].tolist()
+    return [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+
+
+def _mechanics(bodies: Sequence[_Body], q: Vector, v: Vector, gravity: Vector, armature: Vector) -> tuple[Matrix, Vector]:
     """(M, bias) of the bodies that move, in order: q[i], v[i] are those of body i, and armature[i] is added to M's diagonal
     (anything where it is fixed); gravity (3,) in the world's frame. Drag is part of the bias.
     """
@@ -54,19 +122,19 @@ def mechanics(
     return [[mass[i][j] for j in moved] for i in moved], [bias[i] for i in moved]
 
 
-def _poses(bodies: Sequence[Body], q: Sequence[Any]) -> tuple[list[Matrix], list[Vector]]:
+def _poses(bodies: Sequence[_Body], q: Vector) -> tuple[list[Matrix], list[Vector]]:
     """Of every body's frame in its parent's: rotation and origin."""
     turns: list[Matrix] = []
     places: list[Vector] = []
     for b, angle in zip(bodies, q, strict=True):
-        fixed = [list(row) for row in b.turn]
+        fixed = b.turn
         if b.kind == "revolute":
-            turns.append(_product(fixed, _rotation(list(b.axis), angle)))
-            places.append(list(b.place))
+            turns.append(_product(fixed, _rotation(b.axis, angle)))
+            places.append(b.place)
         else:
             turns.append(fixed)
             slid = b.kind == "prismatic"
-            places.append(_add(list(b.place), _scale(angle, _apply(fixed, list(b.axis)))) if slid else list(b.place))
+            places.append(_add(b.place, _scale(angle, _apply(fixed, b.axis))) if slid else b.place)
     return turns, places
 
 
@@ -85,10 +153,10 @@ def _rotation(a: Vector, angle: Any) -> Matrix:
     return out
 
 
-def _mass(bodies: Sequence[Body], turns: list[Matrix], places: list[Vector]) -> Matrix:
+def _mass(bodies: Sequence[_Body], turns: list[Matrix], places: list[Vector]) -> Matrix:
     n = len(bodies)
     mass = [b.mass for b in bodies]
-    moment = [_scale(b.mass, list(b.com)) for b in bodies]
+    moment = [_scale(b.mass, b.com) for b in bodies]
     inertia = [_about_origin(b) for b in bodies]
     for i in reversed(range(n)):
         p = bodies[i].parent
@@ -100,7 +168,7 @@ def _mass(bodies: Sequence[Body], turns: list[Matrix], places: list[Vector]) -> 
             mass[p], moment[p] = mass[p] + m, _add(moment[p], _add(h, _scale(m, r)))
     out: Matrix = [[0.0] * n for _ in range(n)]
     for j in range(n):
-        a = list(bodies[j].axis)
+        a = bodies[j].axis
         if bodies[j].kind == "fixed":
             continue
         if bodies[j].kind == "revolute":
@@ -110,7 +178,7 @@ def _mass(bodies: Sequence[Body], turns: list[Matrix], places: list[Vector]) -> 
         i = j
         while True:
             if bodies[i].kind != "fixed":
-                out[i][j] = out[j][i] = _dot(list(bodies[i].axis), torque if bodies[i].kind == "revolute" else force)
+                out[i][j] = out[j][i] = _dot(bodies[i].axis, torque if bodies[i].kind == "revolute" else force)
             if bodies[i].parent < 0:
                 break
             force = _apply(turns[i], force)
@@ -119,9 +187,7 @@ def _mass(bodies: Sequence[Body], turns: list[Matrix], places: list[Vector]) -> 
     return out
 
 
-def _bias(
-    bodies: Sequence[Body], turns: list[Matrix], places: list[Vector], v: Sequence[Any], gravity: Sequence[Any]
-) -> Vector:
+def _bias(bodies: Sequence[_Body], turns: list[Matrix], places: list[Vector], v: Vector, gravity: Vector) -> Vector:
     zero, dragged = [0.0, 0.0, 0.0], any(isinstance(d, Value) or d for b in bodies for d in b.drag)
     spin: list[Vector] = []
     speed: list[Vector] = []
@@ -134,10 +200,10 @@ def _bias(
         w, dw, a, moves = (
             (spin[b.parent], turning[b.parent], rising[b.parent], speed[b.parent])
             if b.parent >= 0
-            else (zero, zero, _scale(-1.0, list(gravity)), zero)
+            else (zero, zero, _scale(-1.0, gravity), zero)
         )
         back, r = _transposed(turns[i]), places[i]
-        rate = zero if b.kind == "fixed" else _scale(v[i], list(b.axis))
+        rate = zero if b.kind == "fixed" else _scale(v[i], b.axis)
         here = _apply(back, w)
         rise = _apply(back, _add(a, _add(_cross(dw, r), _cross(w, _cross(w, r)))))
         turn = _apply(back, dw)
@@ -146,7 +212,7 @@ def _bias(
             turn, here = _add(turn, _cross(here, rate)), _add(here, rate)
         elif b.kind == "prismatic":
             rise, move = _add(rise, _scale(2.0, _cross(here, rate))), _add(move, rate)
-        com, inertia = list(b.com), [list(row) for row in b.inertia]
+        com, inertia = b.com, b.inertia
         centre = _add(rise, _add(_cross(turn, com), _cross(here, _cross(here, com))))
         momentum = _apply(inertia, here)
         force = _scale(b.mass, centre)
@@ -163,7 +229,7 @@ def _bias(
     for i in reversed(range(len(bodies))):
         b = bodies[i]
         if b.kind != "fixed":
-            out[i] = _dot(list(b.axis), torques[i] if b.kind == "revolute" else forces[i])
+            out[i] = _dot(b.axis, torques[i] if b.kind == "revolute" else forces[i])
         if b.parent >= 0:
             force = _apply(turns[i], forces[i])
             forces[b.parent] = _add(forces[b.parent], force)
@@ -171,7 +237,7 @@ def _bias(
     return out
 
 
-def _drag(b: Body, v: Vector, w: Vector, momentum: Vector) -> tuple[Vector, Vector]:
+def _drag(b: _Body, v: Vector, w: Vector, momentum: Vector) -> tuple[Vector, Vector]:
     """What holds a body back: m v (a + b |v|), and I ω (c + d |ω|) of its momentum I ω."""
     linear, square, angular, twice = b.drag
     push = _scale(b.mass * (linear + square * _length(v)), v)
@@ -187,9 +253,9 @@ def _length(a: Vector) -> Any:
     return square.max(_TINY).sqrt() if isinstance(square, Value) else math.sqrt(square)
 
 
-def _about_origin(b: Body) -> Matrix:
-    com = list(b.com)
-    return _sum([list(row) for row in b.inertia], [_scale(b.mass, row) for row in _spread(com, com)])
+def _about_origin(b: _Body) -> Matrix:
+    com = b.com
+    return _sum(b.inertia, [_scale(b.mass, row) for row in _spread(com, com)])
 
 
 def _spread(a: Vector, b: Vector) -> Matrix:
