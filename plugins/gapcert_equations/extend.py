@@ -34,13 +34,9 @@ def _add(config: EquationsConfig, e: Extension) -> EquationsConfig:
     e, clock = _written(config, e, where)
     changes: dict[str, Any] = {"parameters": {**config.parameters, **{p.name: _stated(p) for p in e.parameters}}}
     forces = {site: text for site, text in {e.site: e.force, **e.forces}.items() if text is not None}
-    added = {
-        "forces" if config.form == "mechanical" else "derivative": forces,
-        "dry_friction": {e.site: e.dry_friction} if e.dry_friction is not None else {},
-        "payload": {e.site: e.payload} if e.payload is not None else {},
-        "tilt": {e.site: e.tilt} if e.tilt is not None else {},
-        "implicit": {e.site: e.implicit} if e.implicit is not None else {},
-    }
+    added = {"forces" if config.form == "mechanical" else "derivative": forces}
+    laws = ("dry_friction", "payload", "tilt", "implicit")
+    added |= {section: {e.site: text} for section in laws if (text := getattr(e, section)) is not None}
     for section, texts in added.items():
         old = getattr(config, section) or {}
         if texts:

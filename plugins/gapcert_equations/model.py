@@ -208,24 +208,24 @@ class EquationsModel(Model):
         if tape is None:
             return x
         with np.errstate(all="ignore"):
-            given = {k: np.asarray(v, dtype=np.float64) for k, v in (parameters or {}).items()}
-            stated = zip(self.parameters, self._stated.values, strict=True)
-            known = [*(given.get(p.name, v) for p, v in stated), self.definition.dynamics.substep(ARRAY)]
+            known = [*self._values(parameters), self.definition.dynamics.substep(ARRAY)]
             unseen = [np.float64(0)] * len(self.definition.memory)
             values = tape.run(ARRAY, tape.prepare(ARRAY, known), [*_split(np.concatenate([x, u], axis=1)), *unseen])
         return _stacked([0.0 if v is None else v for v in values], len(x))
 
     def output_delays(self, parameters: Values | None = None) -> Array:
         """Seconds by which each output shows the past, at the given values of parameters: (ny,), or (n, ny)."""
-        late = self.definition.output_delays
-        given = {k: np.asarray(v, dtype=np.float64) for k, v in (parameters or {}).items()}
-        rows = np.broadcast_shapes(*(v.shape for v in given.values()))
-        out = np.zeros((*rows, len(self.outputs)))
+        late, values = self.definition.output_delays, self._values(parameters)
+        out = np.zeros((*np.broadcast_shapes(*map(np.shape, values)), len(self.outputs)))
         if late is not None:
-            values = [given.get(p.name, np.float64(p.value)) for p in self.parameters]
             for y, seconds in zip(late.at, self._of_parameters(late.tape, values), strict=True):
                 out[..., y] = 0.0 if seconds is None else np.maximum(seconds, 0.0)
         return out
+
+    def _values(self, given: Values | None) -> Columns:
+        """Of the parameters: as stated, or as given, a number each or one per row."""
+        known = {k: np.asarray(v, dtype=np.float64) for k, v in (given or {}).items()}
+        return [known.get(p.name, np.float64(p.value)) for p in self.parameters]
 
     def extend(self, extensions: Sequence[Extension]) -> EquationsModel:
         """A model whose section has the effects written into its expressions."""
