@@ -37,7 +37,8 @@ _ONE, _TWO, _THREE, _FOUR = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(
 _ADD, _SUB, _MUL, _DIV, _NEG, _COPY, _MULADD, _MULSUB, _SUBMUL = (CODES[n] for n in ARITHMETIC)
 _GIVEN = types.int64[::1], types.int64[::1], types.float64[:, ::1], types.int64
 
-# Called by compiled functions alone: from Python they would crash. Inner ones make no arrays, and need not count references.
+# The first two are called by compiled functions alone: from Python they would crash. Inner ones make no arrays, and need not
+# count references; contracted ones may fuse a product with a sum.
 compiled = compiler(nogil=True, error_model="numpy", no_cpython_wrapper=True)
 inner = compiler(nogil=True, error_model="numpy", _nrt=False, no_cpython_wrapper=True)
 contracted = compiler(nogil=True, error_model="numpy", fastmath={"contract"}, _nrt=False)

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from gapcert_equations.config import Axis, EquationsConfig, MemoryConfig, ParameterConfig, Problem, PythonConfig
+from gapcert_equations.config import Axes, Axis, EquationsConfig, MemoryConfig, ParameterConfig, Problem, PythonConfig
 
 from . import units
 from .grammar import name_problem, near
 from .units import NONE, SECOND, Dimension
-
-if TYPE_CHECKING:
-    from gapcert_equations.config import Axes
 
 Path = tuple[str | int, ...]
 
