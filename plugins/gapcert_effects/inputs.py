@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from typing import ClassVar, final
 
 import gapcert as gc
+from gapcert.plugin import EffectParameter, Extension, Memory, site_units
 from gapcert_effects.thresholds import THRESHOLDS
 
-from .shared.experiments import BOTH_WAYS, FAST, FREE_DECAY, LEVELS, SECOND, SMALL_AND_LARGE
-from .shared.law import Law
-from .shared.sites import NEVER, spread
+from .experiments import BOTH_WAYS, FAST, FREE_DECAY, LEVELS, SECOND, SMALL_AND_LARGE
+from .law import NEVER, Law, spread
 
 
 def _lagging(target: str) -> tuple[str, str]:
@@ -32,7 +32,7 @@ class InputDelay(Law):
 
     name = "input-delay"
     site = "input"
-    parameters = (gc.plugin.EffectParameter("delay", {"time": 1}, (0.003, 0.02, 0.05), 0.0, THRESHOLDS.latest_input),)
+    parameters = (EffectParameter("delay", {"time": 1}, (0.003, 0.02, 0.05), 0.0, THRESHOLDS.latest_input),)
     equation = "u(t − delay) acts"
     adds: ClassVar = {"delay": "{delay}"}
     signature = "the response to fast inputs lags, the response to slow ones is right"
@@ -52,7 +52,7 @@ class InputDeadZone(Law):
 
     name = "input-dead-zone"
     site = "input"
-    parameters = (gc.plugin.EffectParameter("width", {"input_peak": 1}, (0.05, 0.3), 0.0, 1.0),)
+    parameters = (EffectParameter("width", {"input_peak": 1}, (0.05, 0.3), 0.0, 1.0),)
     equation = "u − clip(u, ±width) acts"
     adds: ClassVar = {"input": "{u} - min(max({u}, -{width}), {width})"}
     signature = "small inputs do nothing, large ones act weaker by a constant"
@@ -75,9 +75,9 @@ class InputRateLimit(Law):
 
     name = "input-rate-limit"
     site = "input"
-    parameters = (gc.plugin.EffectParameter("rate", {"input": 1, "time": -1}, (2.0, 20.0), 0.02, 2e4, off=NEVER),)
+    parameters = (EffectParameter("rate", {"input": 1, "time": -1}, (2.0, 20.0), 0.02, 2e4, off=NEVER),)
     equation = "r acts, ṙ = ±rate until r = u"
-    memory = gc.plugin.Memory("{rate}_reached", "{input}", f"{{memory}} + {_MOVED}")
+    memory = Memory("{rate}_reached", "{input}", f"{{memory}} + {_MOVED}")
     adds: ClassVar = {"input": f"{{memory}} + ({_MOVED})*(1 - abs({_MOVED})/(2*{{rate}}*{{h}}))"}
     signature = "steps become ramps, and fast large inputs come out as smaller triangles"
     experiment = SMALL_AND_LARGE
@@ -100,8 +100,8 @@ class InputRateLimitedLag(Law):
     name = "input-rate-limited-lag"
     site = "input"
     parameters = (
-        gc.plugin.EffectParameter("rate", {"input": 1, "time": -1}, (2.0, 10.0), 0.02, 2e4, off=NEVER),
-        gc.plugin.EffectParameter("time_constant", {"time": 1}, (0.01, 0.05), 0.0, THRESHOLDS.slowest_lag),
+        EffectParameter("rate", {"input": 1, "time": -1}, (2.0, 10.0), 0.02, 2e4, off=NEVER),
+        EffectParameter("time_constant", {"time": 1}, (0.01, 0.05), 0.0, THRESHOLDS.slowest_lag),
     )
     equation = "r acts, ṙ = clip((u − r)/time_constant, ±rate)"
     signature = "large steps become ramps with a rounded end, small ones arrive rounded"
@@ -115,9 +115,9 @@ class InputRateLimitedLag(Law):
         """Ramps of the largest input in 1 s and less, with a lag of some share of that time."""
         return [(r * scales["input_peak"], share / r) for r in (1.0, 4.0, 16.0) for share in (0.06, 0.25, 0.8)]
 
-    def extension(self, site: str, model: gc.Model) -> gc.plugin.Extension:
+    def extension(self, site: str, model: gc.Model) -> Extension:
         rate, time = (p.name for p in self.named(site, model))
-        unit = gc.plugin.site_units(model, self.site, site)["input"]
+        unit = site_units(model, self.site, site)["input"]
         r = f"{rate.removesuffix('_rate')}_reached"
         gap = f"({{u}} - {r})"
         ramp = f"min(max(abs({gap})/{rate} - {time}, 0), {{h}})"
@@ -127,8 +127,8 @@ class InputRateLimitedLag(Law):
         # ∫(u − r) = (u − r)·ramp − ½·rate·ramp² on the ramp, time·left·(1 − decay) after it.
         share = f"{time}*(1 - {decay})"
         behind = f"{gap}*({ramp} + {share}) - {rate}*sign({gap})*{ramp}*({ramp}/2 + {share})"
-        memory = (gc.plugin.Memory(r, unit, f"{{u}} - {left}*{decay}"),)
-        return gc.plugin.Extension(self.name, site, self.named(site, model), input=f"{{u}} - ({behind})/{{h}}", memory=memory)
+        memory = (Memory(r, unit, f"{{u}} - {left}*{decay}"),)
+        return Extension(self.name, site, self.named(site, model), input=f"{{u}} - ({behind})/{{h}}", memory=memory)
 
 
 @final
@@ -137,9 +137,9 @@ class InputLag(Law):
 
     name = "input-lag"
     site = "input"
-    parameters = (gc.plugin.EffectParameter("time_constant", {"time": 1}, (0.005, 0.03, 0.1), 0.0, THRESHOLDS.slowest_lag),)
+    parameters = (EffectParameter("time_constant", {"time": 1}, (0.005, 0.03, 0.1), 0.0, THRESHOLDS.slowest_lag),)
     equation = "r acts, time_constant·ṙ = u − r"
-    memory = gc.plugin.Memory("{time_constant}_reached", "{input}", _ARRIVED[1])
+    memory = Memory("{time_constant}_reached", "{input}", _ARRIVED[1])
     adds: ClassVar = {"input": _ARRIVED[0]}
     signature = "steps arrive rounded, and fast inputs come out smaller and late"
     experiment = FAST
@@ -158,11 +158,11 @@ class SupplySag(Law):
     name = "supply-sag"
     site = "input"
     parameters = (
-        gc.plugin.EffectParameter("sag", {"input": -1}, (0.1, 0.3), -0.5, 1.0, plausible=(0.0, float("inf"))),
-        gc.plugin.EffectParameter("time_constant", {"time": 1}, (0.1, 0.5, 2.0), 0.01, 10.0, off=1.0),
+        EffectParameter("sag", {"input": -1}, (0.1, 0.3), -0.5, 1.0, plausible=(0.0, float("inf"))),
+        EffectParameter("time_constant", {"time": 1}, (0.1, 0.5, 2.0), 0.01, 10.0, off=1.0),
     )
     equation = "u·(1 − sag·p) acts, time_constant·ṗ = |u| − p"
-    memory = gc.plugin.Memory("{sag}_drained", "{input}", _DRAINED[1])
+    memory = Memory("{sag}_drained", "{input}", _DRAINED[1])
     adds: ClassVar = {"input": f"{{u}}*(1 - {{sag}}*({_DRAINED[0]}))"}
     signature = "the gain falls while the input is large, and recovers while it is small"
     experiment = "hold a large input for seconds, then a small one: the gain falls, and comes back"
@@ -178,7 +178,7 @@ class InputGain(Law):
 
     name = "input-gain"
     site = "input"
-    parameters = (gc.plugin.EffectParameter("gain", {}, (0.8, 1.25), -5.0, 5.0, off=1.0, plausible=(0.3, 3.0)),)
+    parameters = (EffectParameter("gain", {}, (0.8, 1.25), -5.0, 5.0, off=1.0, plausible=(0.3, 3.0)),)
     equation = "gain·u acts"
     adds: ClassVar = {"input": "{gain}*{u}"}
     signature = "the response to every input level is wrong by the same factor"
@@ -206,7 +206,7 @@ class InputOffset(Law):
 
     name = "input-offset"
     site = "input"
-    parameters = (gc.plugin.EffectParameter("offset", {"input": 1}, (-0.1, 0.1), -3.0, 3.0),)
+    parameters = (EffectParameter("offset", {"input": 1}, (-0.1, 0.1), -3.0, 3.0),)
     equation = "u + offset acts"
     adds: ClassVar = {"input": "{u} + {offset}"}
     signature = "at input zero the motion is driven"
@@ -224,7 +224,7 @@ class InputSaturation(Law):
 
     name = "input-saturation"
     site = "input"
-    parameters = (gc.plugin.EffectParameter("level", {"input_peak": 1}, (0.3, 0.8), 0.002, 1.0, off=NEVER),)
+    parameters = (EffectParameter("level", {"input_peak": 1}, (0.3, 0.8), 0.002, 1.0, off=NEVER),)
     equation = "clip(u, ±level) acts"
     adds: ClassVar = {"input": "min(max({u}, -{level}), {level})"}
     signature = "small inputs act as they should, large ones all alike"

@@ -6,17 +6,15 @@ from collections.abc import Mapping
 from typing import ClassVar, final
 
 import numpy as np
-import numpy.typing as npt
 
-import gapcert as gc
+from gapcert import Array
+from gapcert.plugin import EffectParameter
 from gapcert_effects.thresholds import THRESHOLDS
 
-from .shared.experiments import CREEP, FAST, FREE_DECAY, PLACES, SECOND
-from .shared.lattice import lattice
-from .shared.law import Law
-from .shared.sites import spread
+from .experiments import CREEP, FAST, FREE_DECAY, PLACES, SECOND
+from .law import Law, spread
 
-FINEST = 1e-15  # of an output's unit: a resolution that rounds nothing
+_FINEST = 1e-15  # of an output's unit: a resolution that rounds nothing
 
 
 @final
@@ -25,7 +23,7 @@ class SensorBias(Law):
 
     name = "sensor-bias"
     site = "output"
-    parameters = (gc.plugin.EffectParameter("bias", {"output": 1}, (-0.1, 0.1), -3.0, 3.0),)
+    parameters = (EffectParameter("bias", {"output": 1}, (-0.1, 0.1), -3.0, 3.0),)
     equation = "y + bias is seen"
     adds: ClassVar = {"output": "{y} + {bias}"}
     signature = "equilibria are shifted, and the motion about them is right only from a shifted place"
@@ -42,7 +40,7 @@ class SensorScale(Law):
 
     name = "sensor-scale"
     site = "output"
-    parameters = (gc.plugin.EffectParameter("scale", {}, (0.9, 1.1), -5.0, 5.0, off=1.0, plausible=(0.5, 2.0)),)
+    parameters = (EffectParameter("scale", {}, (0.9, 1.1), -5.0, 5.0, off=1.0, plausible=(0.5, 2.0)),)
     equation = "scale·y is seen"
     adds: ClassVar = {"output": "{scale}*{y}"}
     signature = "free swings have the right frequency for another amplitude"
@@ -59,7 +57,7 @@ class SensorDelay(Law):
 
     name = "sensor-delay"
     site = "output"
-    parameters = (gc.plugin.EffectParameter("delay", {"time": 1}, (0.003, 0.02, 0.05), 0.0, THRESHOLDS.latest_output),)
+    parameters = (EffectParameter("delay", {"time": 1}, (0.003, 0.02, 0.05), 0.0, THRESHOLDS.latest_output),)
     equation = "y(t − delay) is seen"
     adds: ClassVar = {"output_delay": "{delay}"}
     signature = "this output comes late in all that it shows, whatever moves it"
@@ -78,7 +76,7 @@ class SensorQuantisation(Law):
 
     name = "sensor-quantisation"
     site = "output"
-    parameters = (gc.plugin.EffectParameter("resolution", {"output": 1}, (0.05, 0.2), 1e-3, 2.0, off=FINEST),)
+    parameters = (EffectParameter("resolution", {"output": 1}, (0.05, 0.2), 1e-3, 2.0, off=_FINEST),)
     equation = "resolution·round(y/resolution) is seen"
     adds: ClassVar = {"output": "{resolution}*round({y}/{resolution})"}
     signature = "values lie on a lattice, and slow motion comes in steps"
@@ -86,6 +84,70 @@ class SensorQuantisation(Law):
     family = "quantum"
     rivals: ClassVar = {"coulomb-friction": CREEP, "sensor-bias": PLACES}
 
-    def seen_in(self, values: npt.NDArray[np.float64]) -> dict[str, float] | None:
-        step = lattice(values)
+    def seen_in(self, values: Array) -> dict[str, float] | None:
+        step = _lattice(values)
         return None if step is None else {"resolution": step}
+
+
+def _lattice(values: Array) -> float | None:
+    """The step δ of values near multiples of δ (and an offset), or None.
+
+    |mean exp(2πi y/δ)| is 1 on a lattice, exp(−2π²σ²/δ²) under noise σ that is added to it, and about 1/√cells else.
+    """
+    y = values[np.isfinite(values)]
+    if (step := _exact(y)) is not None:
+        return step
+    floor = float(np.sqrt(np.mean(np.diff(y, 4) ** 2) / 70)) if len(y) > 50 else 0.0
+    reach = float(np.ptp(y)) if len(y) else 0.0
+    if not (floor > 0 and reach > THRESHOLDS.lattice_coarsest * THRESHOLDS.lattice_finest * floor):
+        return None
+    cell = np.minimum(((y - y.min()) / reach * THRESHOLDS.lattice_cells).astype(int), THRESHOLDS.lattice_cells - 1)
+    count = np.bincount(cell, minlength=THRESHOLDS.lattice_cells)
+    levels = int(np.count_nonzero(count))
+    if levels < THRESHOLDS.lattice_levels:
+        return None
+    weight = 1.0 / (levels * count[cell])
+    frequency, found = _spectrum(y, weight, reach, floor)
+    inside = (frequency >= max(THRESHOLDS.lattice_coarsest / reach, 1 / (THRESHOLDS.lattice_widest * floor))) & (
+        frequency <= 1 / (THRESHOLDS.lattice_finest * floor)
+    )
+    peaks = np.where(inside, found, 0.0)
+    # The largest of some thousand sums of `levels` random phases stays below 2.8/√levels.
+    if peaks.max() < min(0.98, 0.1 + 2.8 / np.sqrt(levels)):
+        return None
+    first = int(np.argmax(peaks >= 0.9 * peaks.max()))
+    while first + 1 < len(peaks) and peaks[first + 1] > peaks[first]:
+        first += 1
+    return _regressed(y, weight, 1 / float(frequency[first]))
+
+
+def _exact(y: Array) -> float | None:
+    """The step of a few values that come again and again, where all of them are whole multiples of it apart."""
+    levels = np.unique(np.round(y, 12))
+    if not 3 <= len(levels) <= len(y) / THRESHOLDS.lattice_repeats:
+        return None
+    apart = np.diff(levels)
+    ratio = apart / apart.min()
+    step = float(np.ptp(levels) / np.round(ratio).sum())
+    coarse = step > THRESHOLDS.lattice_finest * float(np.sqrt(np.mean(np.diff(y, 4) ** 2) / 70))
+    return step if coarse and np.abs(ratio - np.round(ratio)).max() < 1e-3 else None
+
+
+def _spectrum(y: Array, weight: Array, reach: float, floor: float) -> tuple[Array, Array]:
+    """(frequencies, |Σ w exp(2πi f y)|) by one transform of a fine histogram."""
+    bins = int(min(THRESHOLDS.lattice_bins, np.ceil(reach / (0.2 * floor))))
+    width = reach / bins
+    at = np.minimum(((y - y.min()) / width).astype(int), bins - 1)
+    total = np.bincount(at, weight, minlength=bins)
+    return np.asarray(np.fft.rfftfreq(8 * bins, width)), np.asarray(np.abs(np.fft.rfft(total, 8 * bins)), dtype=np.float64)
+
+
+def _regressed(y: Array, weight: Array, step: float) -> float:
+    """The step that fits best once every value has its whole number."""
+    for _ in range(4):
+        phase = np.angle(np.sum(weight * np.exp(2j * np.pi * (y - y.mean()) / step)))
+        origin = y.mean() + phase * step / (2 * np.pi)
+        number = np.round((y - origin) / step)
+        centred = number - np.sum(weight * number)
+        step = float(np.sum(weight * centred * y) / np.sum(weight * centred * number))
+    return step

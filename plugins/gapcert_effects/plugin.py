@@ -11,32 +11,26 @@ HOMES = {
         "asymmetric-coulomb-friction": "dry friction that is stronger in one direction than in the other",
         "stribeck-friction": "dry friction that is stronger near rest, and falls to its level at higher speed",
         "load-dependent-friction": "dry friction in proportion to the force that the drive transmits",
-    },
-    "bristles": {
         "dahl-friction": "dry friction with bristles that bend like a spring before they slide",
         "lugre-friction": "bristles that bend before they slide, and that slide with less friction at higher speed",
     },
-    "elastic": {
-        "linear-spring": "a force towards zero, proportional to the distance",
-        "cubic-spring": "a spring that stiffens with the third power of the distance",
-        "joint-coupling": "a force in proportion to the speed of the neighbouring coordinate",
-    },
-    "gravity": {
+    "forces": {
         "constant-force": "a force that never changes",
         "gravity-tilt": "a base that does not stand level",
         "payload": "a mass that is carried at a point, and that the model does not know",
-    },
-    "drive": {
+        "linear-spring": "a force towards zero, proportional to the distance",
+        "cubic-spring": "a spring that stiffens with the third power of the distance",
+        "joint-coupling": "a force in proportion to the speed of the neighbouring coordinate",
         "cogging": "a force that repeats itself along the way",
         "backlash": "play between the drive and the coordinate",
         "wheel-slip": "a driving force that the ground takes only up to its traction",
+        "external-push": "one push from outside",
     },
-    "contact": {
+    "parameters": {
+        "parameter": "a parameter of the model whose stated value is wrong by more than its tolerance",
         "contact-friction": "friction between bodies that touch, stronger or weaker than the engine has it",
         "contact-restitution": "bodies that bounce off each other more or less than the engine has it",
     },
-    "events": {"external-push": "one push from outside"},
-    "parameter": {"parameter": "a parameter of the model whose stated value is wrong by more than its tolerance"},
     "inputs": {
         "input-gain": "an input that acts stronger or weaker than it says",
         "input-offset": "an input that acts as if something were always added to it",

@@ -11,14 +11,12 @@ from gapcert.plugin import chosen, threshold
 class Thresholds:
     """Read as `THRESHOLDS.name`."""
 
-    # the package itself
     min_turns: float = threshold(1.3, "periods over the range: measured on the Silverbox, fewer name a cubic spring")
     max_turns: float = chosen(20.0, "periods over the range of motion that are tried")
     push_starts: int = chosen(80, "tried: the width of a push grows with the length of the recording")
     latest_input: float = chosen(0.1, "s of delay, at most")
     slowest_lag: float = chosen(1.0, "s, of a time constant at most")
     latest_output: float = chosen(0.1, "s of delay, at most")
-    # shared
     lattice_cells: int = chosen(64, "of the range, each with the same say: a joint that rests for long is no lattice")
     lattice_levels: int = chosen(6, "at least: of fewer, steps are chance")
     lattice_coarsest: float = chosen(4.0, "steps over the range, at least")

@@ -12,11 +12,11 @@ from gapcert import Interval, Parameter, StateSpec, UsageError
 from gapcert_equations.thresholds import THRESHOLDS
 
 from .config import Axis, EquationsConfig, MemoryConfig, OutputConfig, ParameterConfig, Problem, PythonConfig
+from .mechanics import bodies, rigid
 from .mechanics.dynamics import Dynamics
-from .mechanics.rigid import terms
 from .programs.arithmetic import INTERVAL
 from .programs.tape import Recorder, Tape
-from .text import checks, units
+from .text import declarations, units
 from .text.grammar import ExpressionError, parse
 from .text.sympy_text import expression, symbol
 from .text.units import SECOND, Checker
@@ -27,20 +27,11 @@ _STEPPED = ("integrator", "substeps", "soft_friction", "friction_after_damping")
 @final
 @dataclass(frozen=True)
 class Delays:
-    """Seconds by which inputs come late (`tape`, of parameters alone), and how many past periods each must remember."""
+    """Seconds by which inputs, or outputs, come late (`tape`, of parameters alone); memory: past periods that inputs keep."""
 
     tape: Tape
-    inputs: tuple[int, ...]
-    memory: tuple[int, ...]
-
-
-@final
-@dataclass(frozen=True)
-class OutputDelays:
-    """Seconds by which outputs come late (`tape`, of parameters alone)."""
-
-    tape: Tape
-    outputs: tuple[int, ...]
+    at: tuple[int, ...]
+    memory: tuple[int, ...] = ()
 
 
 @final
@@ -62,7 +53,7 @@ class Definition:
     start: tuple[float, ...]
     output: Tape | None
     delays: Delays | None
-    output_delays: OutputDelays | None
+    output_delays: Delays | None
 
 
 def refuse(problems: Sequence[Problem]) -> None:
@@ -81,7 +72,7 @@ def define(config: EquationsConfig, base: Definition | None = None) -> Definitio
     base: of another model, such as one that this one extends; what was checked and recorded there is not done again.
     """
     refuse(config.check(base and base.config))
-    states, inputs = checks.states(config), checks.axes(config.inputs)
+    states, inputs = declarations.states(config), declarations.axes(config.inputs)
     parameters = tuple(parameter(n, p) for n, p in config.parameters.items())
     if config.period is None:
         raise UsageError("model.period: missing; give the sampling period, such as 5 ms (a diagnosis takes its recording's)")
@@ -90,7 +81,8 @@ def define(config: EquationsConfig, base: Definition | None = None) -> Definitio
     if (same := recorder.defined.get(texts)) is not None:
         return _stepped(config, same, parameters, period)
     text = _Reader(config, [*states, *inputs, *config.memory], recorder)
-    outputs, late = _outputs(config, states, inputs), config.input_delay
+    outputs, late, seen = _outputs(config, states, inputs), config.input_delay, config.output_delay
+    names = [y.name for y in outputs]
     out = text.recorder.defined[texts] = Definition(
         config=config,
         texts=texts,
@@ -100,13 +92,13 @@ def define(config: EquationsConfig, base: Definition | None = None) -> Definitio
         outputs=outputs,
         parameters=parameters,
         period=period,
-        sites=checks.sites(config),
+        sites=declarations.sites(config),
         dynamics=_dynamics(config, text, list(states), period),
         memory=tuple(StateSpec(n, m.unit) for n, m in config.memory.items()),
         start=tuple(_start(m) for m in config.memory.values()),
         output=text.tape(_output_texts(config)) if config.outputs else None,
         delays=_delays(config, _delay_tape(text, "input_delay", late), parameters, period) if late else None,
-        output_delays=_output_delays(config, text, [y.name for y in outputs]),
+        output_delays=Delays(_delay_tape(text, "output_delay", seen), tuple(map(names.index, seen))) if seen else None,
     )
     return out
 
@@ -167,7 +159,7 @@ def declared(config: PythonConfig) -> tuple[tuple[StateSpec, ...], tuple[StateSp
     """States, inputs, parameters and period of a python model."""
     refuse(config.check())
     parameters = tuple(parameter(n, p) for n, p in config.parameters.items())
-    return specs(checks.axes(config.states)), specs(checks.axes(config.inputs)), parameters, seconds(config.period)
+    return specs(declarations.axes(config.states)), specs(declarations.axes(config.inputs)), parameters, seconds(config.period)
 
 
 @final
@@ -175,7 +167,7 @@ class _Reader:
     """Texts of one model → tapes over its parameters and its columns."""
 
     def __init__(self, config: EquationsConfig, columns: Sequence[str], recorder: Recorder) -> None:
-        self.parameters = [symbol(n) for n in (*config.parameters, checks.substep(config))]
+        self.parameters = [symbol(n) for n in (*config.parameters, declarations.substep(config))]
         self.columns = [symbol(n) for n in columns]
         self.recorder = recorder.knowing(self.parameters, self.columns)
 
@@ -197,21 +189,19 @@ def _dynamics(config: EquationsConfig, text: _Reader, states: list[str], period:
     if config.form == "next":
         equations = config.next or {}
         return Dynamics(text.tape({f"next.{x}": equations[x] for x in states}), memory, **_how(config, period))
-    sites = checks.sites(config)
+    sites = declarations.sites(config)
     friction = [text.read(f"dry_friction.{s}", config.dry_friction.get(s, "0")) for s in sites]
     if config.form == "derivative":
         derivative = config.derivative or {}
         rates = [text.read(f"derivative.{s}", derivative[s]) for s in sites]
         rows = tuple(states.index(s) for s in sites)
-        moves = tuple((states.index(q), states.index(v)) for q, v in checks.positions(derivative).items())
+        moves = tuple((states.index(q), states.index(v)) for q, v in declarations.positions(derivative).items())
     else:
         n = len(sites)
         if config.bodies is not None:
-            from .mechanics.tree import terms as tree
-
-            mass, rates = tree(config, text.recorder, text.read)
+            mass, rates = bodies.terms(config, text.recorder, text.read)
         else:
-            m = terms(config, text.read)
+            m = rigid.terms(config, text.read)
             mass, rates = m.mass, [f - b for f, b in zip(m.forces, m.bias, strict=True)]
         rates = [e for row in mass for e in row] + rates
         friction += [text.read(f"implicit.{s}", config.implicit.get(s, "0")) for s in sites if config.implicit]
@@ -223,7 +213,7 @@ def _how(config: EquationsConfig, period: float) -> dict[str, Any]:
     """How Dynamics step in time."""
     if config.form == "next":
         return {"period": period}
-    soft = [(s.compliance, s.rate) if (s := config.soft_friction.get(q)) else None for q in checks.sites(config)]
+    soft = [(s.compliance, s.rate) if (s := config.soft_friction.get(q)) else None for q in declarations.sites(config)]
     how = {"integrator": config.scheme, "substeps": config.substeps, "period": period, "softness": tuple(soft)}
     return how | {"late": config.friction_after_damping}
 
@@ -238,7 +228,7 @@ def _outputs(config: EquationsConfig, states: Mapping[str, Axis], inputs: Mappin
     if not config.outputs:
         return specs(states)
     names = {n: units.unit(a.unit)[0] for n, a in columns.items()}
-    names |= {n: checks.parameter_dimension(p) for n, p in config.parameters.items()}
+    names |= {n: declarations.parameter_dimension(p) for n, p in config.parameters.items()}
     out = []
     for y, given in config.outputs.items():
         o = given if isinstance(given, OutputConfig) else OutputConfig(expr=given)
@@ -250,16 +240,9 @@ def _outputs(config: EquationsConfig, states: Mapping[str, Axis], inputs: Mappin
 
 def _delay_tape(text: _Reader, section: str, delays: Mapping[str, str]) -> Tape:
     """Of quantities, and of expressions of parameters."""
-    constants = {n: checks.quantity_in(given, SECOND) for n, given in delays.items()}
+    constants = {n: declarations.quantity_in(given, SECOND) for n, given in delays.items()}
     texts = {n: given if constants[n] is None else repr(constants[n]) for n, given in delays.items()}
     return text.tape({f"{section}.{n}": t for n, t in texts.items()}, columns=False)
-
-
-def _output_delays(config: EquationsConfig, text: _Reader, outputs: Sequence[str]) -> OutputDelays | None:
-    if not config.output_delay:
-        return None
-    tape = _delay_tape(text, "output_delay", config.output_delay)
-    return OutputDelays(tape, tuple(outputs.index(y) for y in config.output_delay))
 
 
 def _delays(config: EquationsConfig, tape: Tape, parameters: Sequence[Parameter], period: float) -> Delays:

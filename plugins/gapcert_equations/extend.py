@@ -12,7 +12,7 @@ from gapcert import Parameter, UsageError
 from gapcert.plugin import Extension
 
 from .config import EquationsConfig, MemoryConfig, OutputConfig, ParameterConfig
-from .text import checks
+from .text import declarations
 from .text.grammar import near, parse, substitute
 from .text.units import SECOND
 
@@ -34,13 +34,9 @@ def _add(config: EquationsConfig, e: Extension) -> EquationsConfig:
     e, clock = _written(config, e, where)
     changes: dict[str, Any] = {"parameters": {**config.parameters, **{p.name: _stated(p) for p in e.parameters}}}
     forces = {site: text for site, text in {e.site: e.force, **e.forces}.items() if text is not None}
-    added = {
-        "forces" if config.form == "mechanical" else "derivative": forces,
-        "dry_friction": {e.site: e.dry_friction} if e.dry_friction is not None else {},
-        "payload": {e.site: e.payload} if e.payload is not None else {},
-        "tilt": {e.site: e.tilt} if e.tilt is not None else {},
-        "implicit": {e.site: e.implicit} if e.implicit is not None else {},
-    }
+    added = {"forces" if config.form == "mechanical" else "derivative": forces}
+    laws = ("dry_friction", "payload", "tilt", "implicit")
+    added |= {section: {e.site: text} for section in laws if (text := getattr(e, section)) is not None}
     for section, texts in added.items():
         old = getattr(config, section) or {}
         if texts:
@@ -60,7 +56,7 @@ def _add(config: EquationsConfig, e: Extension) -> EquationsConfig:
 
 
 def _names_are_free(config: EquationsConfig, e: Extension, where: str) -> None:
-    taken = {*checks.states(config), *config.inputs, *config.parameters, *config.memory, checks.substep(config)}
+    taken = {*declarations.states(config), *config.inputs, *config.parameters, *config.memory, declarations.substep(config)}
     for kind, name in [("parameter", p.name) for p in e.parameters] + [("memory", m.name) for m in e.memory]:
         if name in taken:
             raise UsageError(f"{where}: {kind} '{name}' is already a name of the model; rename it")
@@ -86,9 +82,9 @@ def _written(config: EquationsConfig, e: Extension, where: str) -> tuple[Extensi
     filled["memory"] = tuple(_replaced(m, next=fill(m.next)) for m in e.memory)
     clock = {}
     if "{t}" in used and "time" not in config.memory:
-        if "time" in {*checks.states(config), *config.inputs, *config.parameters}:
+        if "time" in {*declarations.states(config), *config.inputs, *config.parameters}:
             raise UsageError(f"{where}: the model has a 'time' of its own, which the clock of effects needs; rename it")
-        clock = {"time": MemoryConfig(unit="s", next=f"time + {checks.substep(config)}")}
+        clock = {"time": MemoryConfig(unit="s", next=f"time + {declarations.substep(config)}")}
     return _replaced(e, **filled), clock
 
 
@@ -99,12 +95,12 @@ def _replaced(data: Any, **changes: Any) -> Any:
 
 def _placeholders(config: EquationsConfig, e: Extension, where: str) -> Texts:
     """What {q}, {v}, {u}, {f}, {y}, {t}, {h} stand for at the site."""
-    general = {"{t}": "time", "{h}": checks.substep(config)}
+    general = {"{t}": "time", "{h}": declarations.substep(config)}
     if e.input is not None or e.delay is not None:
         _require(where, e.site, config.inputs)
         return {"{u}": e.site, **general}
     if e.output is not None or e.output_delay is not None:
-        known = dict(config.outputs) or {x: x for x in checks.states(config)}
+        known = dict(config.outputs) or {x: x for x in declarations.states(config)}
         _require(where, e.site, known)
         old = known[e.site]
         return {"{y}": _bracketed(old.expr if isinstance(old, OutputConfig) else old)}
@@ -114,14 +110,14 @@ def _placeholders(config: EquationsConfig, e: Extension, where: str) -> Texts:
             _require(where, e.frees, config.parameters)
         return general
     for site in (e.site, *e.forces):
-        _require(where, site, checks.sites(config))
+        _require(where, site, declarations.sites(config))
     if config.form == "mechanical":
         names = {"{q}": e.site, "{v}": f"{e.site}_dot", "{f}": config.forces.get(e.site, "0")}
     else:
         if e.tilt is not None or e.payload is not None or e.implicit is not None:
             raise UsageError(f"{where}: gravity, payloads and inertia act through a mass_matrix; this model is a derivative")
         names = {"{v}": e.site, "{f}": (config.derivative or {})[e.site]}
-        integrals = [q for q, v in checks.positions(config.derivative or {}).items() if v == e.site]
+        integrals = [q for q, v in declarations.positions(config.derivative or {}).items() if v == e.site]
         if integrals:
             names["{q}"] = integrals[0]
     return {**names, "{f}": _bracketed(names["{f}"]), **general}
@@ -137,7 +133,7 @@ def _require(where: str, site: str, known: Sequence[str] | Mapping[str, Any]) ->
 
 
 def _later(where: str, old: str | None, new: str) -> str:
-    seconds = checks.quantity_in(old, SECOND) if old is not None else 0.0
+    seconds = declarations.quantity_in(old, SECOND) if old is not None else 0.0
     if seconds == 0:
         return new
     if seconds is not None:
@@ -168,7 +164,7 @@ def _stated(p: Parameter) -> ParameterConfig:
 
 
 def _outputs(config: EquationsConfig, e: Extension) -> dict[str, str | OutputConfig]:
-    outputs: dict[str, str | OutputConfig] = dict(config.outputs) or {x: x for x in checks.states(config)}
+    outputs: dict[str, str | OutputConfig] = dict(config.outputs) or {x: x for x in declarations.states(config)}
     old, new = outputs[e.site], e.output or ""
     return outputs | {e.site: old.model_copy(update={"expr": new}) if isinstance(old, OutputConfig) else new}
 

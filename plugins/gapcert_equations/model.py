@@ -20,16 +20,13 @@ from gapcert_equations.thresholds import THRESHOLDS
 from .build import Definition, define
 from .config import EquationsConfig
 from .mechanics.dynamics import Prepared
-from .mechanics.friction import Columns
-from .programs.arithmetic import ARRAY, INTERVAL, Dual, array_table, dual_table
-from .programs.columns import boxes, split, stacked
+from .programs.arithmetic import ARRAY, INTERVAL, SEEN, Dual, Seen, array_table, dual_table
 from .programs.jets import JET, Jet
-from .programs.tape import Table, Tape
+from .programs.tape import Columns, Table, Tape
 from .programs.trace import Program, trace
-from .programs.unmoved import unmoved
 
 if TYPE_CHECKING:
-    from .programs.rollouts import Compiled
+    from .programs.machine import Compiled
 
 _CHUNK = 1 << 15
 
@@ -54,7 +51,7 @@ class EquationsModel(Model):
         self.capabilities = frozenset({"parameters"})
         if d.sites:
             self.capabilities |= {"forces"}
-        late = zip(d.delays.inputs, d.delays.memory, strict=True) if d.delays else ()
+        late = zip(d.delays.at, d.delays.memory, strict=True) if d.delays else ()
         delayed = [(d.inputs[i], k) for i, memory in late for k in range(1, memory + 1)]
         remembered = tuple(StateSpec(f"{s.name}_delay_{k}", s.unit, s.kind) for s, k in delayed)
         self.hidden, self.hidden_default = (*remembered, *d.memory), ((0.0,) * len(remembered) + d.start)
@@ -92,14 +89,14 @@ class EquationsModel(Model):
             kicks = forces[0] if self._lone(len(x)) else np.ascontiguousarray(np.moveaxis(forces, 0, -1))
         with np.errstate(all="ignore"):
             new, past = self._columns(ARRAY, fixed, self._split(x), self._split(u), past, kicks)
-        return Step(stacked(new, len(x)), None if past is None else stacked(past, len(x)))
+        return Step(_stacked(new, len(x)), None if past is None else _stacked(past, len(x)))
 
     def _lone(self, n: int) -> bool:
         return n == 1 and self._plain
 
     def _split(self, rows: Array) -> Columns:
         """(n, columns) as columns, or numbers."""
-        return list(rows[0]) if self._lone(len(rows)) else split(rows)
+        return list(rows[0]) if self._lone(len(rows)) else _split(rows)
 
     def _rollout(self, x0: Array, u_sequence: Array, **options: Any) -> Step:
         n, steps, _ = u_sequence.shape
@@ -118,7 +115,7 @@ class EquationsModel(Model):
                     out[k + 1, j] = column
         if not np.isfinite(out).all():
             return super()._rollout(x0, u_sequence, **options)
-        return Step(np.ascontiguousarray(out.transpose(2, 0, 1)), None if past is None else stacked(past, n))
+        return Step(np.ascontiguousarray(out.transpose(2, 0, 1)), None if past is None else _stacked(past, n))
 
     def fast_rollout(
         self, x0: Array, u: Array, *, parameters: Values | None = None, hidden: Array | None = None, every: int = 1
@@ -141,7 +138,7 @@ class EquationsModel(Model):
     def _compiled(self) -> Compiled | None:
         if importlib.util.find_spec("numba") is None:
             return None
-        from .programs.rollouts import Compiled
+        from .programs.machine import Compiled
 
         return Compiled(self.program, self.nx, self.nu, self.substeps, self.parameters, self.hidden_default, self.late)
 
@@ -158,7 +155,7 @@ class EquationsModel(Model):
         """∂x⁺/∂(x, u) from the derivatives of the expressions, through the integrator."""
         x, u = self._batch("x", x, self.nx), self._batch("u", u, self.nu)
         out = np.zeros((len(x), self.nx, self.nx + self.nu))
-        for i, row in enumerate(self._slopes(ARRAY, self._stated, split(np.concatenate([x, u], axis=1)))):
+        for i, row in enumerate(self._slopes(ARRAY, self._stated, _split(np.concatenate([x, u], axis=1)))):
             for j, slope in row.items():
                 out[:, i, j] = slope
         return out
@@ -189,7 +186,15 @@ class EquationsModel(Model):
 
     def unmoved(self, u: Array) -> npt.NDArray[np.bool_]:
         """By the zeros among the inputs; nothing is known where something is remembered, or where friction is."""
-        return unmoved(self._from_default, self._stated, u, self.nx, not self.hidden and self.definition.dynamics.frictionless)
+        if self.hidden or not self.definition.dynamics.frictionless:
+            return super().unmoved(u)
+        patterns, which = np.unique(u == 0, axis=0, return_inverse=True)
+        found = np.empty((len(patterns), self.nx), dtype=bool)
+        for row, zeros in zip(found, patterns, strict=True):
+            x = [Seen() for _ in range(self.nx)]
+            after = self._from_default(SEEN, self._stated, [*x, *(Seen(bool(zero)) for zero in zeros)])
+            row[:] = [a is b for a, b in zip(after, x, strict=True)]
+        return found[which.reshape(-1)]
 
     def curvature_enclosure(self, z: Interval, axis: int) -> Interval:
         """Derivatives of second order in interval arithmetic; the whole line where a box may hold a kink."""
@@ -203,24 +208,24 @@ class EquationsModel(Model):
         if tape is None:
             return x
         with np.errstate(all="ignore"):
-            given = {k: np.asarray(v, dtype=np.float64) for k, v in (parameters or {}).items()}
-            stated = zip(self.parameters, self._stated.values, strict=True)
-            known = [*(given.get(p.name, v) for p, v in stated), self.definition.dynamics.substep(ARRAY)]
+            known = [*self._values(parameters), self.definition.dynamics.substep(ARRAY)]
             unseen = [np.float64(0)] * len(self.definition.memory)
-            values = tape.run(ARRAY, tape.prepare(ARRAY, known), [*split(np.concatenate([x, u], axis=1)), *unseen])
-        return stacked([0.0 if v is None else v for v in values], len(x))
+            values = tape.run(ARRAY, tape.prepare(ARRAY, known), [*_split(np.concatenate([x, u], axis=1)), *unseen])
+        return _stacked([0.0 if v is None else v for v in values], len(x))
 
     def output_delays(self, parameters: Values | None = None) -> Array:
         """Seconds by which each output shows the past, at the given values of parameters: (ny,), or (n, ny)."""
-        late = self.definition.output_delays
-        given = {k: np.asarray(v, dtype=np.float64) for k, v in (parameters or {}).items()}
-        rows = np.broadcast_shapes(*(v.shape for v in given.values()))
-        out = np.zeros((*rows, len(self.outputs)))
+        late, values = self.definition.output_delays, self._values(parameters)
+        out = np.zeros((*np.broadcast_shapes(*map(np.shape, values)), len(self.outputs)))
         if late is not None:
-            values = [given.get(p.name, np.float64(p.value)) for p in self.parameters]
-            for y, seconds in zip(late.outputs, self._of_parameters(late.tape, values), strict=True):
+            for y, seconds in zip(late.at, self._of_parameters(late.tape, values), strict=True):
                 out[..., y] = 0.0 if seconds is None else np.maximum(seconds, 0.0)
         return out
+
+    def _values(self, given: Values | None) -> Columns:
+        """Of the parameters: as stated, or as given, a number each or one per row."""
+        known = {k: np.asarray(v, dtype=np.float64) for k, v in (given or {}).items()}
+        return [known.get(p.name, np.float64(p.value)) for p in self.parameters]
 
     def extend(self, extensions: Sequence[Extension]) -> EquationsModel:
         """A model whose section has the effects written into its expressions."""
@@ -307,7 +312,7 @@ class EquationsModel(Model):
         if delays is None:
             return []
         out = []
-        for i, memory, delay in zip(delays.inputs, delays.memory, self._of_parameters(delays.tape, parameters), strict=True):
+        for i, memory, delay in zip(delays.at, delays.memory, self._of_parameters(delays.tape, parameters), strict=True):
             ratio = np.maximum(0.0 if delay is None else delay, 0.0) / self.period
             ratio = np.where(np.abs(ratio - np.round(ratio)) < THRESHOLDS.whole_ratio, np.round(ratio), ratio)
             if not (ratio <= memory).all():
@@ -347,11 +352,11 @@ class EquationsModel(Model):
 
     def _enclose(self, z: Interval) -> Interval:
         n = len(z)
-        natural = boxes(self._from_default(INTERVAL, self._exact, [z[:, j] for j in range(z.shape[1])]), n)
+        natural = _boxes(self._from_default(INTERVAL, self._exact, [z[:, j] for j in range(z.shape[1])]), n)
         if self.definition.dynamics.coupled_friction or np.array_equal(z.lo, z.hi):
             return natural
         c = z.mid
-        centre = boxes(self._from_default(INTERVAL, self._exact, [Interval.exact(c[:, j]) for j in range(z.shape[1])]), n)
+        centre = _boxes(self._from_default(INTERVAL, self._exact, [Interval.exact(c[:, j]) for j in range(z.shape[1])]), n)
         return natural.intersect(centre + Interval.dot(self._derivative(z), (z - c)[:, None, :]))
 
     def _derivative(self, z: Interval) -> Interval:
@@ -366,7 +371,7 @@ class EquationsModel(Model):
         columns[axis] = Jet(columns[axis], INTERVAL["number"](1, 1))
         with np.errstate(all="ignore"):
             new = [c.bend if isinstance(c, Jet) else None for c in self._from_default(JET, self._exact, columns)]
-        return boxes([Interval.exact(0.0) if b is None else b for b in new], len(z))
+        return _boxes([Interval.exact(0.0) if b is None else b for b in new], len(z))
 
     @cached_property
     def _exact(self) -> _Fixed:
@@ -381,3 +386,21 @@ class _Fixed:
     values: Columns
     prepared: Prepared
     weights: list[tuple[int, int, list[Any]]]
+
+
+def _split(rows: Array) -> Columns:
+    """(n, columns) as contiguous columns."""
+    return list(np.ascontiguousarray(rows.T))
+
+
+def _stacked(columns: Columns, n: int) -> Array:
+    """Columns, some of them constant, as (n, columns)."""
+    out = np.empty((n, len(columns)))
+    for j, c in enumerate(columns):
+        out[:, j] = c
+    return out
+
+
+def _boxes(columns: Columns, n: int) -> Interval:
+    """Columns of Intervals."""
+    return Interval(_stacked([c.lo for c in columns], n), _stacked([c.hi for c in columns], n))

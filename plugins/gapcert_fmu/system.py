@@ -9,6 +9,7 @@ import tempfile
 import threading
 import weakref
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any, Literal, final
 
@@ -23,10 +24,8 @@ from gapcert_fmu.thresholds import THRESHOLDS
 
 from .archive import unpack
 from .config import FmuConfig
-from .description import Description
-from .exchange import Exchange
-from .instance import Instance, Numbers, Restart
-from .wiring import wire
+from .description import Description, wire
+from .instance import Exchange, Instance, Numbers, Restart
 
 _Option = Literal["hidden", "parameters"]
 
@@ -187,14 +186,12 @@ class FmuBackend(Backend):
 
     def _asked(self, restart: Restart) -> Array:
         """Answers to a few queries, and to some of them again after one with other parameters."""
-        instance, few = self._make(restart), self._few()
+        few = self._few()
         other = {p.name: p.value * 1.01 for p in self.parameters if p.value and p.low <= p.value * 1.01 <= p.high}
         changed = np.concatenate([few[:1], np.array([list(other.values())])], axis=1)
-        try:
+        with closing(self._make(restart)) as instance:
             first = self._answers(instance, few, [])
             return np.concatenate([first, self._answers(instance, changed, list(other)), self._answers(instance, few[:2], [])])
-        finally:
-            instance.close()
 
     def _few(self) -> Array:
         """The start values, and two states beside them under other inputs."""
@@ -236,23 +233,18 @@ class FmuBackend(Backend):
         ]
         on = self._going_on(row[:width], inputs)
         scale, limit = np.maximum(np.abs(row[:width]), 1e-6), THRESHOLDS.memory_change + 100 * (self._tolerance or 0.0)
-        instance, state = self._make(self._restart), row[:width]
-        try:
+        state = row[:width]
+        with closing(self._make(self._restart)) as instance:
             for k, u in enumerate(inputs):
                 (state,) = self._answers(instance, np.concatenate([state, u])[None], [])
                 scale = np.maximum(scale, np.abs(state))
                 if k in on:
                     self._compare(on[k], state, scale, limit, k + 1)
-        finally:
-            instance.close()
 
     def _going_on(self, state: Array, inputs: Sequence[Array]) -> dict[int, Array]:
         """States and hidden states after some of the periods (from 0), without a new start between them."""
-        instance, found, pushes = (
-            self._make("instantiate"),
-            Numbers(self._wiring.reads),
-            Numbers(self._wiring.writes[len(state) :]),
-        )
+        instance, found = self._make("instantiate"), Numbers(self._wiring.reads)
+        pushes = Numbers(self._wiring.writes[len(state) :])
         try:
             if instance.exchanges:
                 row = np.concatenate([state, inputs[0]])

@@ -11,10 +11,8 @@ _HOME = homes(
         "gapcert_functions.bounded_function": "Function Sloped mean_value",
         "gapcert_functions.dominating": "DominatingGap band dominate",
         "gapcert_functions.expression": "Expression",
-        "gapcert_functions.lifting": "Cones Part Side Table lift",
-        "gapcert_functions.multilinear_bands": "Band",
-        "gapcert_functions.products": "Factor Term",
-        "gapcert_functions.sums": "WeightedSum weighted",
+        "gapcert_functions.lifting": "Band Cones Part Side Table lift",
+        "gapcert_functions.sums": "Factor Term WeightedSum weighted",
     }
 )
 

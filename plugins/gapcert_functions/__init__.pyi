@@ -5,13 +5,13 @@ from gapcert_functions.dominating import DominatingGap as DominatingGap
 from gapcert_functions.dominating import band as band
 from gapcert_functions.dominating import dominate as dominate
 from gapcert_functions.expression import Expression as Expression
+from gapcert_functions.lifting import Band as Band
 from gapcert_functions.lifting import Cones as Cones
 from gapcert_functions.lifting import Part as Part
 from gapcert_functions.lifting import Side as Side
 from gapcert_functions.lifting import Table as Table
 from gapcert_functions.lifting import lift as lift
-from gapcert_functions.multilinear_bands import Band as Band
-from gapcert_functions.products import Factor as Factor
-from gapcert_functions.products import Term as Term
+from gapcert_functions.sums import Factor as Factor
+from gapcert_functions.sums import Term as Term
 from gapcert_functions.sums import WeightedSum as WeightedSum
 from gapcert_functions.sums import weighted as weighted

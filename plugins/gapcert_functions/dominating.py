@@ -24,8 +24,7 @@ from gapcert.plugin import (
 )
 
 from .bounded_function import Function
-from .lifting import Cones, Part, Side, Table, lift
-from .multilinear_bands import Band
+from .lifting import Band, Cones, Part, Side, Table, lift
 
 Index = npt.NDArray[np.intp]
 
@@ -186,34 +185,28 @@ def dominate(
 def band(problem: GapProblem) -> GapFunction:
     """The band that `dominate` lifts functions above: the family `multilinear` where samples on a lattice and bounds of
     curvature allow it, else the `envelope`."""
-    found: GapFunction = registry().build("gap_family", "multilinear" if _banded(problem) else "envelope").fit(problem)
+    family = "envelope" if _nodes(problem) is None else "multilinear"
+    found: GapFunction = registry().build("gap_family", family).fit(problem)
     return found
 
 
-def _banded(problem: GapProblem) -> bool:
-    bound, axes = problem.lipschitz, problem.samples.lattice
+def _nodes(problem: GapProblem) -> Sequence[Array] | None:
+    """Per axis, the nodes between which `band` is multilinear; None where it is the envelope."""
+    bound = problem.lipschitz
     usable = bound.curvature is not None and bound.cells is None and not problem.domain.relations
-    return usable and axes is not None and problem.predictor.kind != "multilinear" and not problem.spread
+    return problem.samples.lattice if usable and problem.predictor.kind != "multilinear" and not problem.spread else None
 
 
 def _side(problem: GapProblem, i: int, sign: int) -> Sequence[Part]:
-    """One side of `band` for state i; the lower one as its mirror image, with sign −1."""
-    axes, bound = problem.samples.lattice, problem.lipschitz
-    if not _banded(problem) or axes is None:
-        return envelope_side(problem, i, sign)
-    counts = [len(a) for a in axes]
-    g = sign * problem.remainder[-int(np.prod(counts)) :, i].reshape(counts)
-    bends = [bound.bend(j, a)[i] for j, a in enumerate(axes)]
+    """The upper side of `band` for state i; with sign −1, the mirror image of its lower side."""
+    z, g, bound, whole = problem.samples.z, sign * problem.remainder[:, i], problem.lipschitz, problem.domain.interval
     slack = float(np.nextafter(2 * problem.remainder_resolution[i], np.inf))
-    return [Band.of(problem.domain.interval, axes, Interval.exact(g), bends, bound.value[i], slack)]
-
-
-def envelope_side(problem: GapProblem, i: int, sign: int) -> list[Cones]:
-    """The cones of state i of the problem's envelope: its upper side, or, with sign −1, the mirror image of the lower."""
-    z, g, bound = problem.samples.z, sign * problem.remainder[:, i], problem.lipschitz
-    slack = float(np.nextafter(2 * problem.remainder_resolution[i], np.inf))
+    if (axes := _nodes(problem)) is not None:
+        counts, bends = [len(a) for a in axes], [bound.bend(j, a)[i] for j, a in enumerate(axes)]
+        nodes = Interval.exact(g[-int(np.prod(counts)) :].reshape(counts))
+        return [Band.of(whole, axes, nodes, bends, bound.value[i], slack)]
     if bound.cells is None:
-        return [Cones(problem.domain.interval, z, g, bound.value[i], slack)]
+        return [Cones(whole, z, g, bound.value[i], slack)]
     members, boxes = bound.cells.closures(z), bound.cells.boxes
     made = [Cones(boxes[c : c + 1], z[rows], g[rows], bound.cells.constants[c, i], slack) for c, rows in enumerate(members)]
     jumps = bound.cells.jumps[:, i]

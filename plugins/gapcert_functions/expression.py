@@ -5,6 +5,8 @@ A node is a number; ["axis", j]; ["+", a, b, …]; ["*", a, b, …]; ["^", a, n]
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import isfinite, prod
@@ -56,11 +58,11 @@ class Expression:
 
     def value(self, z: Array) -> Array:
         """(n, nz) → (n,)."""
-        return np.ascontiguousarray(np.broadcast_to(_value(self.tree, z), (len(z),)))
+        return np.ascontiguousarray(np.broadcast_to(_evaluated(self.tree, z), (len(z),)))
 
     def over(self, boxes: Interval) -> Interval:
         """(n, nz) → (n,)."""
-        return _full(_over(self.tree, boxes), len(boxes))
+        return _full(_evaluated(self.tree, boxes, over=True), len(boxes))
 
     def derivative_over(self, boxes: Interval, j: int) -> Interval:
         """Contains ∂/∂z_j over each box, (n,), differentiated forwards."""
@@ -115,45 +117,26 @@ def _axes(node: Any) -> set[int]:
     return set().union(*(_axes(p) for p in (parts[:1] if op == "^" else parts)))
 
 
-def _value(node: Any, z: Array) -> Any:
+def _evaluated(node: Any, z: Any, over: bool = False) -> Any:
+    """A node at points z (n, nz), or over boxes."""
     if not isinstance(node, list):
-        return float(node)
+        return Interval.exact(float(node)) if over else float(node)
     op, *parts = node
     if op == "axis":
         return z[:, parts[0]]
-    first = _value(parts[0], z)
+    first = _evaluated(parts[0], z, over)
     if op == "^":
-        out = first
-        for _ in range(parts[1] - 1):
-            out = out * first
-        return out
+        return first ** parts[1] if over else functools.reduce(operator.mul, [first] * parts[1])
     if op in FUNCTIONS:
-        return FUNCTIONS[op][0](first)
-    for part in parts[1:]:
-        first = first + _value(part, z) if op == "+" else first * _value(part, z)
-    return first
-
-
-def _over(node: Any, boxes: Interval) -> Interval:
-    if not isinstance(node, list):
-        return Interval.exact(float(node))
-    op, *parts = node
-    if op == "axis":
-        return boxes[:, parts[0]]
-    first = _over(parts[0], boxes)
-    if op == "^":
-        return first.__pow__(int(parts[1]))
-    if op in FUNCTIONS:
-        return FUNCTIONS[op][1](first)
-    for part in parts[1:]:
-        first = first + _over(part, boxes) if op == "+" else first * _over(part, boxes)
-    return first
+        return FUNCTIONS[op][1 if over else 0](first)
+    rest = [_evaluated(p, z, over) for p in parts[1:]]
+    return functools.reduce(operator.add if op == "+" else operator.mul, rest, first)
 
 
 def _dual(node: Any, boxes: Interval, j: int) -> tuple[Interval, Interval | None]:
     """Ranges of a node and of its derivative along axis j; None for one that is 0."""
     if j not in _axes(node):
-        return _over(node, boxes), None
+        return _evaluated(node, boxes, over=True), None
     op, *parts = node
     if op == "axis":
         return boxes[:, j], Interval.exact(1.0)
@@ -182,11 +165,11 @@ def _running(node: Any, box: Interval) -> tuple[float, float]:
     if not isinstance(node, list):
         return abs(float(node)), 0.0
     op, *parts = node
-    size = float(_over(node, box).mag.max())
+    size = float(_evaluated(node, box, over=True).mag.max())
     if op == "axis":
         return size, 0.0
     if op in FUNCTIONS:
-        argument = _over(parts[0], box)
+        argument = _evaluated(parts[0], box, over=True)
         reach = _running(parts[0], box)[1]
         wide = argument + Interval(np.asarray(-reach), np.asarray(reach)) if isfinite(reach) else argument
         slope, value = (float(f(wide).mag.max()) for f in (FUNCTIONS[op][2], FUNCTIONS[op][1]))

@@ -16,8 +16,8 @@ from gapcert_diagnosis.search.candidates import Candidate, Library
 from gapcert_diagnosis.search.criterion import agreement, better, falls, noise
 from gapcert_diagnosis.search.fitted_sets import FittedSets
 from gapcert_diagnosis.testing import ROD, equations
+from gapcert_effects.forces import ConstantForce
 from gapcert_effects.friction import CoulombFriction, ViscousFriction
-from gapcert_effects.gravity import ConstantForce
 from gapcert_effects.inputs import InputDelay
 from gapcert_recordings.smoothing import noise_floor
 

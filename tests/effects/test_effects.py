@@ -13,7 +13,7 @@ from gapcert_diagnosis.testing import CARRIER, PAIR, equations
 from gapcert_effects.friction import ViscousFriction
 from gapcert_effects.plugin import HOMES
 
-NAMES = [name for home, effects in HOMES.items() for name in effects if home != "contact"]
+NAMES = [name for effects in HOMES.values() for name in effects if not name.startswith("contact-")]
 CHECKS = [c for c in dir(EffectContract) if c.startswith("test_")]
 ENGINES = {"contact-friction", "contact-restitution", "engine-setting"}
 

@@ -9,7 +9,7 @@ import pytest
 
 import gapcert as gc
 from gapcert_equations.config import EquationsConfig
-from gapcert_equations.programs import rows
+from gapcert_equations.programs import operations
 from gapcert_equations.programs import trace as tracing
 from gapcert_equations.programs.machine import run
 from gapcert_equations.programs.trace import CODES, SUBSTEP, Graph, table
@@ -170,7 +170,7 @@ def test_without_numba_the_answers_are_the_same(spec, monkeypatch):
     inputs = np.tile(u, (2, 1, 1))
     fast = model.fast_rollout(x0, u, parameters=values, hidden=hidden, every=3), model.along(x, inputs, hidden=hidden)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    monkeypatch.setattr("gapcert_equations.programs.rollouts.run", None)
+    monkeypatch.setattr("gapcert_equations.programs.machine.run", None)
     agree(fast[0], model.fast_rollout(x0, u, parameters=values, hidden=hidden, every=3))
     np.testing.assert_allclose(fast[1], model.along(x, inputs, hidden=hidden), rtol=1e-12, atol=1e-13)
 
@@ -194,24 +194,24 @@ def test_refuses_what_does_not_fit(change, says):
 def test_sines_and_cosines_are_those_of_the_library(scale):
     x = np.random.default_rng(0).uniform(-scale, scale, 5001)
     sine, cosine, other = np.empty_like(x), np.empty_like(x), np.empty_like(x)
-    rows.sines_and_cosines(x, sine, cosine, len(x))
+    operations.sines_and_cosines(x, sine, cosine, len(x))
     for ours, theirs in ((sine, np.sin(x)), (cosine, np.cos(x))):
         assert np.abs((ours - theirs) / np.spacing(np.abs(theirs))).max() <= 2
-    rows.sines(x, other, len(x), 0)
+    operations.sines(x, other, len(x), 0)
     assert np.array_equal(other, sine)
-    rows.sines(x, other, len(x), 1)
+    operations.sines(x, other, len(x), 1)
     assert np.array_equal(other, cosine)
 
 
 def test_exponentials_are_those_of_the_library():
     x = np.concatenate([np.random.default_rng(0).uniform(-700, 700, 5000), [0.0, -0.0, 1e-300, np.nan]])
     out = np.empty_like(x)
-    rows.exponentials(x, out, len(x))
+    operations.exponentials(x, out, len(x))
     np.testing.assert_allclose(out, np.exp(x), rtol=5e-16)
     far = np.array([709.5, 800.0, -745.0, -800.0, np.inf, -np.inf, 1.0])
     with np.errstate(over="ignore", under="ignore"):
         expected = np.exp(far)
-    rows.exponentials(far, far_out := np.empty_like(far), len(far))
+    operations.exponentials(far, far_out := np.empty_like(far), len(far))
     np.testing.assert_allclose(far_out, expected, rtol=5e-16)
 
 
@@ -219,7 +219,7 @@ def test_hyperbolic_tangents_are_those_of_the_library():
     x = np.concatenate([s * np.random.default_rng(0).uniform(-1, 1, 2000) for s in (1e-12, 0.1, 1.0, 5.0, 400.0)])
     x = np.concatenate([x, [0.0, np.inf, -np.inf, np.nan]])
     out = np.empty_like(x)
-    rows.hyperbolic_tangents(x, np.empty_like(x), out, len(x))
+    operations.hyperbolic_tangents(x, np.empty_like(x), out, len(x))
     np.testing.assert_allclose(out, np.tanh(x), rtol=5e-16)
 
 

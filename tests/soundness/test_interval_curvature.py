@@ -92,8 +92,8 @@ def test_no_second_difference_exceeds_the_bound(predictor):
 
 @pytest.mark.exam
 def test_a_wrong_rule_is_found_on_fresh_points(monkeypatch):
-    slope, bend = jets._SMOOTH["tanh"]
-    monkeypatch.setitem(jets._SMOOTH, "tanh", (slope, lambda *given: bend(*given) * 0.9))
+    bend = jets._BENDS["tanh"]
+    monkeypatch.setitem(jets._BENDS, "tanh", lambda *given: bend(*given) * 0.9)
     residual, problem = question()
     assert excess(curved(problem), problem, residual) > 1
 

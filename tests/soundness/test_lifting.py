@@ -18,8 +18,7 @@ from gapcert.numerics.intervals import Interval
 from gapcert_bounds.families.constant import ConstantGap
 from gapcert_bounds.testing.fields import Kink, Waves, gap_problem
 from gapcert_functions.dominating import DominatingGap, dominate
-from gapcert_functions.lifting import Cones, Table
-from gapcert_functions.multilinear_bands import Band
+from gapcert_functions.lifting import Band, Cones, Table
 from gapcert_networks import network as layers
 from gapcert_networks.network import Network
 

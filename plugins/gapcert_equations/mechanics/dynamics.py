@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, final
 
-from gapcert_equations.programs.tape import Table, Tape
+from gapcert_equations.programs.tape import Columns, Table, Tape
 
-from .friction import Columns, Matrix, mean, soft, solve, velocities, with_friction
+from .friction import Matrix, mean, soft, solve, velocities, with_friction
 
 Prepared = tuple[Columns, Columns]
 Terms = tuple[Matrix, Columns, Columns, Columns]

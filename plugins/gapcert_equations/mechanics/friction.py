@@ -7,11 +7,10 @@ from typing import Any
 
 from gapcert import Interval
 from gapcert_equations.programs.arithmetic import Dual
-from gapcert_equations.programs.tape import Table
+from gapcert_equations.programs.tape import Columns, Table
 
 SWEEPS = 50
 
-Columns = list[Any]
 Matrix = list[list[Any]] | None
 
 
@@ -51,35 +50,56 @@ def velocities(table: Table, mass: Matrix, rhs: Columns, bounds: Columns, v: Col
     if all(b is None for b in bounds):
         return free
     limits = _limits(table, bounds)
-    if not coupled(mass):
+    if mass is None or not coupled(mass):
         weights = [1.0 if mass is None else mass[i][i] for i in range(len(v))]
         stop = table["soft"]
         return [a if b is None else stop(a, h * b / w) for a, b, w in zip(free, limits, weights, strict=True)]
-    f = held(table, mass, rhs, bounds, v, h)
+    f = _held(table, mass, rhs, limits, v, h)
     new = _moved(v, h, solve(mass, with_friction(rhs, f)))
     return [a if b is None else _rest(table, a, p, b) for a, p, b in zip(new, f, limits, strict=True)]
 
 
-def held(table: Table, mass: Matrix, rhs: Columns, bounds: Columns, v: Columns, h: Any) -> Columns:
-    """The friction forces themselves, by projected Gauss–Seidel over M⁻¹ where coordinates couple.
-
-    The first guess −(M v / h + rhs) stops every coordinate at once; where no bound cuts it, it is the answer.
-    """
+def mean(table: Table, mass: Matrix, rhs: Columns, bounds: Columns, v: Columns, h: Any) -> Columns:
+    """The friction forces averaged over a sub-step in which every coordinate may slip, stop, rest and turn round."""
+    if all(b is None for b in bounds):
+        return bounds
     limits = _limits(table, bounds)
-    if coupled(mass) and _is_interval(v):
+    if coupled(mass):
+        return _held(table, mass, rhs, limits, v, h, turning=True)
+    out: Columns = list(limits)
+    for i, (b, w) in enumerate(zip(limits, _stopping(mass, rhs, v, h), strict=True)):
+        if b is not None:
+            m = 1.0 if mass is None else mass[i][i]
+            end = table["stop"](v[i], h * rhs[i] / m, h * b / m)
+            out[i] = _clip(table, w + end * m / h, b)
+    return out
+
+
+def _held(table: Table, mass: Matrix, rhs: Columns, limits: Columns, v: Columns, h: Any, turning: bool = False) -> Columns:
+    """The friction forces themselves where coordinates couple, by projected Gauss–Seidel over M⁻¹.
+
+    The first guess stops every coordinate at once; where no bound cuts it, it is the answer. That is right where a motion ends
+    at rest; with `turning`, one that reverses is braked until it stops and driven against −F thereafter, and only what rests
+    already, and may, is held by exactly what acts on it.
+    """
+    if _is_interval(v):
         return [None if b is None else Interval.hull(-b, b) for b in limits]
-    wanted = [-(p / h + r) for p, r in zip(_times(mass, v), rhs, strict=True)]
+    wanted = _stopping(mass, rhs, v, h)
     start = [None if b is None else _clip(table, w, b) for w, b in zip(wanted, limits, strict=True)]
-    if mass is None or not coupled(mass):
-        return start
-    f = _sweep(table, mass, rhs, limits, v, h, start)
+    rows = [i for i, b in enumerate(limits) if b is not None]
+    f = _project(table, _inverse(table, mass, rows, len(v)), _moved(v, h, solve(mass, rhs)), v, limits, h, start, turning)
     if any(b is None for b in limits):
         return f
-    zero = table["number"](0, 1)
-    excess = zero
-    for w, b in zip(wanted, limits, strict=True):
-        excess = table["max"](excess, table["abs"](w) - b)
+    excess = zero = table["number"](0, 1)
+    for a, w, b in zip(v, wanted, limits, strict=True):
+        over = table["abs"](w) - b
+        excess = table["max"](excess, table["max"](over, table["abs"](a)) if turning else over)
     return [table["pick"](excess, zero, a, b) for a, b in zip(start, f, strict=True)]
+
+
+def _stopping(mass: Matrix, rhs: Columns, v: Columns, h: Any) -> Columns:
+    """−(M v / h + rhs): the forces that would stop every coordinate within a sub-step."""
+    return [-(p / h + r) for p, r in zip(_times(mass, v), rhs, strict=True)]
 
 
 def soft(
@@ -103,51 +123,9 @@ def soft(
     return _project(table, inverse, pull, v, limits, one, start)
 
 
-def mean(table: Table, mass: Matrix, rhs: Columns, bounds: Columns, v: Columns, h: Any) -> Columns:
-    """The friction forces averaged over a sub-step in which every coordinate may slip, stop, rest and turn round.
-
-    `held` is right where a motion ends at rest; one that reverses is braked until it stops and driven against −F thereafter.
-    """
-    if all(b is None for b in bounds):
-        return bounds
-    limits = _limits(table, bounds)
-    if coupled(mass) and _is_interval(v):
-        return [None if b is None else Interval.hull(-b, b) for b in limits]
-    wanted = [-(p / h + r) for p, r in zip(_times(mass, v), rhs, strict=True)]
-    if mass is None or not coupled(mass):
-        out: Columns = list(limits)
-        for i, b in enumerate(limits):
-            if b is not None:
-                m = 1.0 if mass is None else mass[i][i]
-                end = table["stop"](v[i], h * rhs[i] / m, h * b / m)
-                out[i] = _clip(table, wanted[i] + end * m / h, b)
-        return out
-    start = [None if b is None else _clip(table, w, b) for w, b in zip(wanted, limits, strict=True)]
-    f = _sweep(table, mass, rhs, limits, v, h, start, turning=True)
-    if any(b is None for b in limits):
-        return f
-    # What rests already, and may, is held by exactly what acts on it.
-    zero = table["number"](0, 1)
-    excess = zero
-    for a, w, b in zip(v, wanted, limits, strict=True):
-        excess = table["max"](excess, table["max"](table["abs"](w) - b, table["abs"](a)))
-    return [table["pick"](excess, zero, a, b) for a, b in zip(start, f, strict=True)]
-
-
 def with_friction(rhs: Columns, friction: Columns) -> Columns:
     """Right-hand sides plus friction; None is a coordinate without."""
     return [r if f is None else r + f for r, f in zip(rhs, friction, strict=True)]
-
-
-def _sweep(
-    table: Table, mass: Matrix, rhs: Columns, limits: Columns, v: Columns, h: Any, start: Columns, turning: bool = False
-) -> Columns:
-    """A fixed number of sweeps: the answer for one row of a batch must not depend on the others.
-
-    A number type whose rows are on their own anyway has a `sweep` that ends when nothing moves.
-    """
-    rows = [i for i, b in enumerate(limits) if b is not None]
-    return _project(table, _inverse(table, mass, rows, len(v)), _moved(v, h, solve(mass, rhs)), v, limits, h, start, turning)
 
 
 def _inverse(table: Table, mass: Matrix, rows: Sequence[int], n: int) -> dict[int, Columns]:
@@ -166,7 +144,11 @@ def _project(
     start: Columns,
     turning: bool = False,
 ) -> Columns:
-    """f within its limits that brings free + h · inverse f closest to zero."""
+    """f within its limits that brings free + h · inverse f closest to zero.
+
+    By a fixed number of sweeps: the answer for one row of a batch must not depend on the others. A number type whose rows are
+    on their own anyway has a `sweep` that ends when nothing moves.
+    """
     f, rows = list(start), list(inverse)
     if "sweep" in table:
         parts = [[a[i] for i in rows] for a in (free, v, limits, start)]

@@ -12,7 +12,7 @@ from sympy.simplify.fu import TR8
 
 from gapcert import UsageError
 from gapcert_equations.config import EquationsConfig
-from gapcert_equations.text import checks, units
+from gapcert_equations.text import declarations, units
 from gapcert_equations.text.sympy_text import symbol
 from gapcert_equations.text.units import ACCELERATION, METRE
 from gapcert_equations.thresholds import THRESHOLDS
@@ -62,7 +62,7 @@ def gravity(config: EquationsConfig, read: Read, size: int) -> list[Any]:
     """As declared, else straight down along the last axis."""
     if config.gravity is None:
         return [sympy.Integer(0)] * (size - 1) + [-_strength(config)]
-    numbers = [checks.quantity_in(text, ACCELERATION) for text in config.gravity]
+    numbers = [declarations.quantity_in(text, ACCELERATION) for text in config.gravity]
     texts = zip(numbers, config.gravity, strict=True)
     return [read(f"gravity.{i}", text if n is None else repr(n)) for i, (n, text) in enumerate(texts)]
 
@@ -70,7 +70,7 @@ def gravity(config: EquationsConfig, read: Read, size: int) -> list[Any]:
 def _strength(config: EquationsConfig) -> Any:
     """The parameter `g` where there is one and it is an acceleration, else standard gravity."""
     g = config.parameters.get("g")
-    known = g is not None and checks.parameter_dimension(g) == ACCELERATION
+    known = g is not None and declarations.parameter_dimension(g) == ACCELERATION
     return symbol("g") if known else sympy.Float(STANDARD_GRAVITY)
 
 
@@ -103,7 +103,7 @@ def _tilted(config: EquationsConfig, t: Terms, k: int, angle: Any) -> Terms:
     slope: forces + M[:, x] g sin(angle).
     """
     names = list(config.coordinates)
-    if units.unit(checks.axes(config.coordinates)[names[k]].unit)[0] == METRE:
+    if units.unit(declarations.axes(config.coordinates)[names[k]].unit)[0] == METRE:
         pull = _strength(config) * sympy.sin(angle)
         return Terms(t.mass, t.bias, [f + row[k] * pull for f, row in zip(t.forces, t.mass, strict=True)])
     rest = {symbol(f"{n}_dot"): sympy.Integer(0) for n in names}

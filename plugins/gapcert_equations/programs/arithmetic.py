@@ -1,4 +1,4 @@
-"""What the operations of a tape mean for each number type: float64 arrays, Intervals, and derivatives of either."""
+"""What the operations of a tape mean for each number type: float64 arrays, Intervals, derivatives of either, and zeros."""
 
 from __future__ import annotations
 
@@ -227,9 +227,9 @@ def _powers(base: Table) -> Table:
     return {"pow": integer_power, "power": general_power}
 
 
-def dual_table(base: Table) -> Table:
-    """Operations on Duals over a number type; plain numbers of that type are constants."""
-    derivatives: Table = {
+def slope_table(base: Table) -> Table:
+    """φ′ of each function at x, from x and y = φ(x)."""
+    return {
         "sin": lambda x, y: base["cos"](x),
         "cos": lambda x, y: -base["sin"](x),
         "tan": lambda x, y: 1.0 + base["pow"](y, 2),
@@ -244,6 +244,11 @@ def dual_table(base: Table) -> Table:
         "asin": lambda x, y: 1.0 / base["sqrt"](1.0 - base["pow"](x, 2)),
         "acos": lambda x, y: -1.0 / base["sqrt"](1.0 - base["pow"](x, 2)),
     }
+
+
+def dual_table(base: Table) -> Table:
+    """Operations on Duals over a number type; plain numbers of that type are constants."""
+    derivatives = slope_table(base)
 
     def unary(name: str) -> Any:
         def apply(x: Any) -> Any:
@@ -304,3 +309,62 @@ def round_slope(x: Any, y: Any) -> Any:
     if not isinstance(x, Interval):
         return 0.0 * y
     return Interval(np.zeros_like(y.lo), np.where(y.lo == y.hi, 0.0, np.inf))
+
+
+# f(0) = 0 exactly, in real numbers and in every library of functions.
+_ODD = ("sin", "tan", "tanh", "asin", "atan", "sqrt", "abs", "sign", "round", "pow", "neg")
+
+
+@final
+class Seen:
+    """A number of which it is known at most that it is zero: then 0 · x and 0 / p are, p a parameter, and x + 0 is x itself."""
+
+    __array_ufunc__ = None
+    __slots__ = ("zero",)
+
+    def __init__(self, zero: bool = False) -> None:
+        self.zero = zero
+
+    def __neg__(self) -> Seen:
+        return self if self.zero else Seen()
+
+    def __add__(self, other: Any) -> Seen:
+        if _zero(other):
+            return self
+        return other if self.zero and isinstance(other, Seen) else Seen()
+
+    __radd__ = __add__
+
+    def __sub__(self, other: Any) -> Seen:
+        return self if _zero(other) else Seen()
+
+    def __rsub__(self, other: Any) -> Seen:
+        return -self if _zero(other) else Seen()
+
+    def __mul__(self, other: Any) -> Seen:
+        return Seen(self.zero or _zero(other))
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other: Any) -> Seen:
+        return Seen(self.zero and not isinstance(other, Seen) and other != 0)
+
+    def __rtruediv__(self, other: Any) -> Seen:
+        return Seen()
+
+
+def _zero(value: Any) -> bool:
+    return value.zero if isinstance(value, Seen) else bool(value == 0)
+
+
+def _follows(name: str, plain: Any) -> Any:
+    def apply(*values: Any) -> Any:
+        if not any(isinstance(v, Seen) for v in values):
+            return plain(*values)
+        return Seen(name in _ODD and _zero(values[0]))
+
+    return apply
+
+
+_ARITHMETIC = ("add", "sub", "mul", "div", "neg", "number")
+SEEN: Table = {name: plain if name in _ARITHMETIC else _follows(name, plain) for name, plain in ARRAY.items()}

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from gapcert import Interval
 
-from .arithmetic import INTERVAL, round_slope, sign_slope, whole_number
+from .arithmetic import INTERVAL, round_slope, sign_slope, slope_table, whole_number
 from .tape import Table
 
 
@@ -87,18 +87,19 @@ def _chained(x: Jet, value: Any, slope: Any, bend: Any) -> Jet:
     return Jet(value, _times(x.slope, slope), _sum(_times(square, bend), _times(x.bend, slope)))
 
 
-# φ′ and φ″ of each function at x, from x, y = φ(x) and d = φ′(x).
-_SMOOTH: dict[str, tuple[Any, Any]] = {
-    "sin": (lambda x, y: x.cos(), lambda x, y, d: -y),
-    "cos": (lambda x, y: -x.sin(), lambda x, y, d: -y),
-    "tan": (lambda x, y: y**2 + 1.0, lambda x, y, d: y * d * 2.0),
-    "exp": (lambda x, y: y, lambda x, y, d: y),
-    "log": (lambda x, y: 1.0 / x, lambda x, y, d: -(d**2)),
-    "sqrt": (lambda x, y: 0.5 / y, lambda x, y, d: d / x * -0.5),
-    "tanh": (lambda x, y: 1.0 - y**2, lambda x, y, d: y * d * -2.0),
-    "atan": (lambda x, y: 1.0 / (x**2 + 1.0), lambda x, y, d: x * d**2 * -2.0),
-    "asin": (lambda x, y: 1.0 / (1.0 - x**2).sqrt(), lambda x, y, d: x * d**3),
-    "acos": (lambda x, y: -1.0 / (1.0 - x**2).sqrt(), lambda x, y, d: x * d**3),
+_SLOPES = slope_table(INTERVAL)
+# φ″ of each function at x, from x, y = φ(x) and d = φ′(x).
+_BENDS: Table = {
+    "sin": lambda x, y, d: -y,
+    "cos": lambda x, y, d: -y,
+    "tan": lambda x, y, d: y * d * 2.0,
+    "exp": lambda x, y, d: y,
+    "log": lambda x, y, d: -(d**2),
+    "sqrt": lambda x, y, d: d / x * -0.5,
+    "tanh": lambda x, y, d: y * d * -2.0,
+    "atan": lambda x, y, d: x * d**2 * -2.0,
+    "asin": lambda x, y, d: x * d**3,
+    "acos": lambda x, y, d: x * d**3,
 }
 
 
@@ -107,8 +108,8 @@ def _smooth(name: str) -> Any:
         if not isinstance(x, Jet):
             return INTERVAL[name](x)
         y = INTERVAL[name](x.value)
-        d = _SMOOTH[name][0](x.value, y)
-        return _chained(x, y, d, _SMOOTH[name][1](x.value, y, d))
+        d = _SLOPES[name](x.value, y)
+        return _chained(x, y, d, _BENDS[name](x.value, y, d))
 
     return apply
 
@@ -187,7 +188,7 @@ def _stop(v: Any, d: Any, k: Any) -> Any:
 
 JET: Table = {
     **INTERVAL,
-    **{name: _smooth(name) for name in _SMOOTH},
+    **{name: _smooth(name) for name in _BENDS},
     "pow": _pow,
     "power": _power,
     "abs": _abs,

@@ -6,12 +6,15 @@ import threading
 import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partialmethod
 from typing import Any, final
 
 from gapcert import UsageError
 from gapcert_equations.text.grammar import FUNCTIONS
 
 Table = dict[str, Callable[..., Any]]
+Columns = list[Any]
+"""Batches as columns, one per number of a row, of any number type."""
 Instruction = tuple[str, tuple[int, ...], tuple[Any, ...]]
 
 
@@ -25,9 +28,7 @@ class Tape:
     intervals compute.
     """
 
-    parameters: int
     fixed: tuple[Instruction, ...]
-    variables: int
     body: tuple[Instruction, ...]
     outputs: tuple[int | None, ...]
 
@@ -102,7 +103,7 @@ class Recorder:
             return tuple([(name, tuple([slots[k] for k in given]), literals) for name, given, literals in items])
 
         results = tuple(None if o is None else slots[o] for o in outputs)
-        return Tape(len(parameters), code(fixed), len(variables), code(body), results)
+        return Tape(code(fixed), code(body), results)
 
     def once(self, given: Any, make: Callable[[], Any]) -> Any:
         """What is recorded of these texts and expressions, recorded the first time."""
@@ -240,8 +241,15 @@ class Value:
         keys = (v.key if isinstance(v, Value) else self.recorder.emit("number", literals=(float(v), 1)) for v in values)
         return Value(self.recorder, self.recorder.emit(name, *keys))
 
-    def __neg__(self) -> Value:
-        return self._new("neg", self)
+    def _of(self, name: str, *others: Any) -> Value:
+        return self._new(name, self, *others)
+
+    __neg__ = partialmethod(_of, "neg")
+    __abs__ = partialmethod(_of, "abs")
+    max = partialmethod(_of, "max")
+    sqrt = partialmethod(_of, "sqrt")
+    sin = partialmethod(_of, "sin")
+    cos = partialmethod(_of, "cos")
 
     def __add__(self, other: Any) -> Any:
         return self if _is(other, 0) else self._new("add", self, other)
@@ -266,21 +274,6 @@ class Value:
         if isinstance(other, Value) or not (_is(other, 0) or _is(other, 1) or _is(other, -1)):
             return self._new("mul", other, self)
         return self * other
-
-    def __abs__(self) -> Value:
-        return self._new("abs", self)
-
-    def max(self, other: Any) -> Value:
-        return self._new("max", self, other)
-
-    def sqrt(self) -> Value:
-        return self._new("sqrt", self)
-
-    def sin(self) -> Value:
-        return self._new("sin", self)
-
-    def cos(self) -> Value:
-        return self._new("cos", self)
 
 
 def _is(value: Any, number: float) -> bool:

@@ -10,8 +10,7 @@ from typing import TypeVar, final
 from gapcert_equations.config import EquationsConfig, OutputConfig, ParameterConfig, Problem
 
 from . import declarations, units
-from .checks import agree, axes, parameter_dimension, quantity_in, states, substep, velocities
-from .declarations import Path
+from .declarations import Path, agree, axes, parameter_dimension, quantity_in, states, substep, velocities
 from .grammar import ExpressionError, check_names, constant, name_problem, parse
 from .units import ACCELERATION, INERTIA, KILOGRAM, METRE, NONE, SECOND, Checker, Dimension, times
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import sympy
 
 from gapcert import Parameter
 from gapcert_equations.config import EquationsConfig, OutputConfig, Softness
+from gapcert_equations.mechanics.rigid import Terms, terms
 from gapcert_equations.thresholds import THRESHOLDS
 
 from .sympy_text import expression, symbol, written
-
-if TYPE_CHECKING:
-    from gapcert_equations.mechanics.rigid import Terms
 
 
 def readable(config: EquationsConfig, parameters: Sequence[Parameter]) -> str:
@@ -35,8 +35,6 @@ def readable(config: EquationsConfig, parameters: Sequence[Parameter]) -> str:
 
 def latex(config: EquationsConfig) -> str:
     """The equations of motion as rows of `align*`."""
-    import sympy
-
     config, carried = _printable(config)
 
     def show(text: str) -> str:
@@ -74,15 +72,11 @@ def latex(config: EquationsConfig) -> str:
 
 
 def _terms(config: EquationsConfig) -> Terms:
-    from gapcert_equations.mechanics.rigid import terms
-
     return terms(config, lambda _, text: expression(text))
 
 
 def _printable(config: EquationsConfig) -> tuple[EquationsConfig, list[str]]:
     """Payloads and tilts worked into the text of the equations, or as sentences where that would fill pages."""
-    import sympy
-
     if not config.payload and not config.tilt:
         return config, []
     if config.bodies is not None:

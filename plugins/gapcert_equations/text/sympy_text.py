@@ -8,25 +8,13 @@ from typing import Any
 
 import sympy
 
-from .grammar import ExpressionError, constant, parse
+from .grammar import FUNCTIONS, ExpressionError, constant, parse
 
-FUNCTIONS: dict[str, Any] = {
-    "sin": sympy.sin,
-    "cos": sympy.cos,
-    "tan": sympy.tan,
-    "exp": sympy.exp,
-    "log": sympy.log,
-    "sqrt": sympy.sqrt,
-    "abs": sympy.Abs,
-    "tanh": sympy.tanh,
-    "atan": sympy.atan,
-    "asin": sympy.asin,
-    "acos": sympy.acos,
-    "sign": sympy.sign,
-    "round": sympy.Function("round", real=True),
-    # SymPy's own Min and Max compare all arguments with each other, which can take very long.
-    "min": sympy.Function("min", real=True),
-    "max": sympy.Function("max", real=True),
+# SymPy's own Min and Max compare all arguments with each other, which can take very long; it has no rounding.
+_PLAIN = ("round", "min", "max")
+_SYMBOLIC: dict[str, Any] = {
+    name: sympy.Function(name, real=True) if name in _PLAIN else getattr(sympy, "Abs" if name == "abs" else name)
+    for name in FUNCTIONS
 }
 
 
@@ -60,7 +48,7 @@ def _walk(node: ast.expr) -> Any:
         return -inner if isinstance(node.op, ast.USub) else inner
     if isinstance(node, ast.Call):
         assert isinstance(node.func, ast.Name)
-        return FUNCTIONS[node.func.id](*(_walk(a) for a in node.args))
+        return _SYMBOLIC[node.func.id](*(_walk(a) for a in node.args))
     assert isinstance(node, ast.BinOp)
     left, right = _walk(node.left), _walk(node.right)
     if isinstance(node.op, ast.Add):

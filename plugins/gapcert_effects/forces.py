@@ -1,0 +1,235 @@
+"""Forces at a coordinate that are no friction: springs, couplings, weight, what a drive does to its force, and pushes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import ClassVar, final
+
+import gapcert as gc
+from gapcert.plugin import EffectParameter, Extension, Memory
+from gapcert_effects.thresholds import THRESHOLDS
+
+from .experiments import BOTH_WAYS, FREE_DECAY, LEVELS, PLACES, SHAKE_AND_HOLD, SMALL_AND_LARGE, VARY_SPEED
+from .law import NEVER, Law, carries, driven, neighbour, placed, spread, straight, tilts
+
+
+@final
+class ConstantForce(Law):
+    """f = F."""
+
+    name = "constant-force"
+    parameters = (EffectParameter("force", {"force": 1}, (-0.1, 0.1), -3.0, 3.0),)
+    equation = "f = force"
+    adds: ClassVar = {"force": "{force}"}
+    signature = "equilibria are shifted, whatever the direction of motion"
+    experiment = BOTH_WAYS
+    amplitude = "force"
+    family = "constant"
+    equivalent: ClassVar = {
+        "input-offset": "where one input is the force at one coordinate",
+        "gravity-tilt": "at a coordinate that moves along a line, and carries nothing that swings",
+    }
+    rivals: ClassVar = {
+        "viscous-friction": BOTH_WAYS,
+        "coulomb-friction": BOTH_WAYS,
+        "asymmetric-coulomb-friction": BOTH_WAYS,
+        "quadratic-drag": BOTH_WAYS,
+        "gravity-tilt": FREE_DECAY,
+        "input-gain": LEVELS,
+        "sensor-bias": PLACES,
+    }
+
+
+@final
+class GravityTilt(Law):
+    """Gravity turned by φ: what rests on q feels q − φ; along a line all masses feel 9.80665·sin φ."""
+
+    name = "gravity-tilt"
+    parameters = (EffectParameter("angle", {"angle": 1}, (-0.1, 0.1), -0.8, 0.8, plausible=(-0.3, 0.3)),)
+    equation = "weight(q − angle) instead of weight(q); along a line + mass·9.80665·sin(angle)"
+    adds: ClassVar = {"tilt": "{angle}"}
+    where = (tilts,)
+    signature = "the equilibrium is turned, and swings about it are not"
+    experiment = FREE_DECAY
+    amplitude = "angle"
+    family = "tilt"
+    equivalent: ClassVar = {
+        "sensor-bias": "at an angle that only gravity pulls back",
+        "constant-force": "at a coordinate that moves along a line, and carries nothing that swings",
+    }
+    rivals: ClassVar = {"constant-force": FREE_DECAY, "sensor-bias": PLACES, "linear-spring": PLACES}
+
+
+@final
+class Payload(Law):
+    """A point mass at the coordinate's point p(q): M + m·JᵀJ, its weight and its centrifugal force, with J = ∂p/∂q."""
+
+    name = "payload"
+    parameters = (EffectParameter("mass", {"mass": 1}, (0.03, 0.2, 0.6), 0.0, 10.0),)
+    equation = "M + mass·JᵀJ, force + mass·Jᵀ·(gravity − J̇·v), J = ∂point/∂q"
+    adds: ClassVar = {"payload": "{mass}"}
+    where = (carries,)
+    signature = "it is slower and heavier, by an inertia and a weight that belong together"
+    experiment = SHAKE_AND_HOLD
+    family = "payload"
+    equivalent: ClassVar = {"parameter": "along a level line, where the model has one mass"}
+    rivals: ClassVar = {"parameter": SHAKE_AND_HOLD, "input-gain": FREE_DECAY, "linear-spring": SHAKE_AND_HOLD}
+
+
+@final
+class LinearSpring(Law):
+    """f = −k·q."""
+
+    name = "linear-spring"
+    parameters = (
+        EffectParameter("stiffness", {"force": 1, "position": -1}, (0.03, 0.3), -30.0, 30.0, plausible=(0.0, float("inf"))),
+    )
+    equation = "f = −stiffness·q"
+    adds: ClassVar = {"force": "-{stiffness}*{q}"}
+    where = (placed,)
+    signature = "the frequency of oscillations is wrong, and more force is needed the farther out it is held"
+    experiment = PLACES
+    amplitude = "stiffness"
+    family = "spring"
+    rivals: ClassVar = {"cubic-spring": PLACES, "constant-force": PLACES, "parameter": SHAKE_AND_HOLD, "gravity-tilt": PLACES}
+
+
+@final
+class CubicSpring(Law):
+    """f = −k·q³: hardening for k > 0, softening for k < 0."""
+
+    name = "cubic-spring"
+    parameters = (EffectParameter("stiffness", {"force": 1, "position": -3}, (0.03, 0.3), -30.0, 30.0),)
+    equation = "f = −stiffness·q³"
+    adds: ClassVar = {"force": "-{stiffness}*{q}**3"}
+    where = (placed,)
+    signature = "the frequency of oscillations changes with their amplitude"
+    experiment = PLACES
+    amplitude = "stiffness"
+    family = "cubic"
+    rivals: ClassVar = {"linear-spring": PLACES, "quadratic-drag": PLACES, "cogging": PLACES}
+
+
+@final
+class JointCoupling(Law):
+    """f = −c·v_other: what moves the neighbouring coordinate also drags at this one."""
+
+    name = "joint-coupling"
+    parameters = (EffectParameter("coefficient", {"force": 1, "velocity": -1}, (-0.1, 0.1), -30.0, 30.0),)
+    equation = "f = −coefficient·v of the next coordinate of the same unit (of the one before, at the last)"
+    signature = "the coordinate is pushed when its neighbour moves, whatever it does itself"
+    experiment = "move the neighbouring coordinate alone, fast and slowly, while this one is held by its drive"
+    where = (neighbour,)
+    amplitude = "coefficient"
+    family = "coupling"
+    rivals: ClassVar = {"viscous-friction": VARY_SPEED, "parameter": FREE_DECAY, "constant-force": BOTH_WAYS}
+
+    def extension(self, site: str, model: gc.Model) -> Extension:
+        (c,) = self.named(site, model)
+        return Extension(self.name, site, (c,), force=f"-{c.name}*{neighbour(site, model)}_dot")
+
+
+@final
+class Cogging(Law):
+    """f = A·sin(2π·q/p + φ): teeth and magnets."""
+
+    name = "cogging"
+    parameters = (
+        EffectParameter("amplitude", {"force": 1}, (0.1,), -3.0, 3.0),
+        # A period that is wrong by p²/range is out of step at one end: slopes need steps far below that.
+        EffectParameter("period", {"position_range": 1}, (0.2,), 0.02, 1 / THRESHOLDS.min_turns, off=1.0, step=2e-4),
+        EffectParameter("phase", {"angle": 1}, (0.1,), -10.0, 10.0),
+    )
+    equation = "f = amplitude·sin(2π·q/period + phase)"
+    adds: ClassVar = {"force": "{amplitude}*sin(2*pi*{q}/{period} + {phase})"}
+    where = (placed,)
+    signature = "slow motion is uneven in a pattern that belongs to places, and rest is preferred at some of them"
+    experiment = "move slowly and evenly over the whole range: the pattern is that of the place, not of the time"
+    amplitude = "amplitude"
+    family = "cogging"
+    rivals: ClassVar = {"cubic-spring": PLACES, "coulomb-friction": PLACES, "linear-spring": PLACES}
+
+    def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
+        """Periods half a turn apart at the ends of the range, so that one of them lies on the slope of every needle."""
+        force, reach = 0.1 * scales["force"], scales["position_range"]
+        turns = [THRESHOLDS.min_turns * 1.05 + 0.5 * k for k in range(round(2 * (THRESHOLDS.max_turns - THRESHOLDS.min_turns)))]
+        return [(force, reach / n, phase) for n in turns for phase in (0.0, 0.5 * math.pi)]
+
+    def canonical(self, values: Mapping[str, float]) -> dict[str, float]:
+        """A positive amplitude, and a phase within half a turn."""
+        phase = values["phase"] + (math.pi if values["amplitude"] < 0 else 0.0)
+        turned = math.remainder(phase, 2 * math.pi)
+        return {**values, "amplitude": abs(values["amplitude"]), "phase": turned}
+
+
+_KEPT = "min(max({memory} - {f}, -{width}), {width})"
+
+
+@final
+class Backlash(Law):
+    """The applied force F reaches the coordinate as F′, which follows once they differ by w: F′⁺ = clip(F′, F ± w)."""
+
+    name = "backlash"
+    parameters = (EffectParameter("width", {"force": 1}, (0.05, 0.3), 0.0, 3.0),)
+    equation = "F′ follows the applied F at a distance of at most width"
+    memory = Memory("{width}_passed", "{force}", f"{{f}} + {_KEPT}")
+    adds: ClassVar = {"force": _KEPT}
+    where = (driven,)
+    signature = "the response lags by a constant difference of the input, after every reversal anew, however slow it is"
+    experiment = "reverse the input slowly and often, at small and at large amplitude, and hold it after each reversal"
+    family = "play"
+    stage = 1
+    rivals: ClassVar = {
+        "input-dead-zone": "reverse the input away from zero: play stays there, a dead zone does not",
+        "input-lag": "reverse slowly, then fast: the width of the loop is that of play at any speed",
+        "input-delay": "reverse slowly, then fast: the width of the loop is that of play at any speed",
+        "coulomb-friction": FREE_DECAY,
+    }
+
+    def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
+        return [(w * scales["force"],) for w in spread(0.02, 1.2, 9)]
+
+
+@final
+class WheelSlip(Law):
+    """F′ = F_t·tanh(F/F_t): the ground takes small forces whole, and never more than the traction."""
+
+    name = "wheel-slip"
+    parameters = (EffectParameter("traction", {"force_peak": 1}, (0.3, 0.8), 0.02, 5.0, off=NEVER),)
+    equation = "F′ = traction·tanh(F/traction) of the applied F"
+    adds: ClassVar = {"force": "{traction}*tanh({f}/{traction}) - {f}"}
+    where = (driven, straight)
+    signature = "hard acceleration and braking are weaker than commanded, gentle ones are right"
+    experiment = SMALL_AND_LARGE
+    family = "limit"
+    stage = 2
+    rivals: ClassVar = {"input-saturation": SMALL_AND_LARGE, "input-gain": LEVELS, "quadratic-drag": FREE_DECAY}
+
+    def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
+        return [(t * scales["force_peak"],) for t in spread(0.05, 3.0, 10)]
+
+
+@final
+class ExternalPush(Law):
+    """f = F for t₀ ≤ t < t₀ + T, as its exact mean over each sub-step, so that t₀ and T have slopes."""
+
+    name = "external-push"
+    parameters = (
+        EffectParameter("force", {"force": 1}, (-0.5, 0.5), -30.0, 30.0),
+        EffectParameter("time", {"time": 1}, (1.0,), float("-inf"), float("inf"), step=0.02),
+        EffectParameter("duration", {"time": 1}, (0.1, 0.4), 1e-3, 10.0, off=1.0, step=0.05),
+    )
+    equation = "f = force while time ≤ t < time + duration"
+    adds: ClassVar = {"force": "{force}*max(0, min({t} + {h}, {time} + {duration}) - max({t}, {time}))/{h}"}
+    signature = "the error starts at one moment, and only what follows from it remains afterwards"
+    experiment = "repeat the same run: a push does not come back, a law does"
+    amplitude = "force"
+    family = "push"
+    rivals: ClassVar = {"constant-force": BOTH_WAYS, "coulomb-friction": "repeat the same run: a push does not come back"}
+
+    def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
+        """Side by side over the whole recording, each as long as its distance to the next."""
+        width = max(0.1, scales["duration"] / THRESHOLDS.push_starts)
+        count = max(1, int(scales["duration"] / width))
+        return [(0.5 * scales["force"], scales["start"] + k * width, width) for k in range(count)]

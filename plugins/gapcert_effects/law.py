@@ -1,0 +1,122 @@
+"""Effects whose law is text, and what a site of a model is like: can a law act there?"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+import gapcert as gc
+from gapcert.plugin import Effect, Extension, Memory, site_units
+from gapcert_effects.plugin import SENTENCES
+
+_LENGTHS = ("m", "mm", "cm", "km")
+NEVER = 1e15  # a limit that nothing reaches; exact in min and max, and within rounding elsewhere
+_SITE = {name: f"{{{name}}}" for name in "qvufyth"}
+"""Placeholders of an Extension, which the model fills."""
+
+
+class Law(Effect):
+    """An effect that its attributes say whole; its sentence is that of its declaration.
+
+    adds: of an Extension (`force`, `input`, …) → text, where `{level}` is the parameter `level` under its name at the site, and
+    `{memory}` the name of the hidden state; memory: that state, its unit perhaps `{force}` or `{input}`, those of the site;
+    where: what must hold of a site and a model for the effect to act there. site: a coordinate, unless the law says otherwise.
+    """
+
+    site: Literal["coordinate", "input", "output", "parameter", "contact"] = "coordinate"
+    adds: ClassVar[Mapping[str, str]] = {}
+    memory: ClassVar[Memory | None] = None
+    where: ClassVar[tuple[Callable[[str, gc.Model], object], ...]] = ()
+
+    def __init_subclass__(cls) -> None:
+        if "sentence" not in vars(cls):
+            cls.sentence = SENTENCES.get(getattr(cls, "name", ""), "")
+
+    def applies(self, site: str, model: gc.Model) -> bool:
+        return all(holds(site, model) for holds in self.where)
+
+    def extension(self, site: str, model: gc.Model) -> Extension:
+        own, memory = self.named(site, model), self.memory
+        names: dict[str, Any] = _SITE | {p.name: n.name for p, n in zip(self.parameters, own, strict=True)}
+        kept: tuple[Memory, ...] = ()
+        if memory is not None:
+            units, name = site_units(model, self.site, site), memory.name.format_map(names)
+            names["memory"] = name
+            kept = (Memory(name, memory.unit.format_map(units), memory.next.format_map(names)),)
+        filled: dict[str, Any] = {what: text.format_map(names) for what, text in self.adds.items()}
+        return Extension(self.name, site, own, memory=kept, **filled)
+
+
+def spread(low: float, high: float, count: int) -> tuple[float, ...]:
+    """`count` numbers from low to high, each the same multiple of the one before."""
+    return tuple(float(v) for v in np.geomspace(low, high, count))
+
+
+def driven(site: str, model: gc.Model) -> bool:
+    """Does an input act at this coordinate (or in this state equation)?"""
+    text = str(_section(model, "forces", "derivative").get(site, "0"))
+    return bool({u.name for u in model.inputs} & _words(text))
+
+
+def placed(site: str, model: gc.Model) -> bool:
+    """Has this coordinate (or the state whose equation this is) a position?"""
+    if _mechanical(model):
+        return site in model.coordinates
+    return site in (str(text).strip() for text in _section(model, "derivative").values())
+
+
+def _mechanical(model: gc.Model) -> bool:
+    return bool(_section(model, "coordinates"))
+
+
+def straight(site: str, model: gc.Model) -> bool:
+    """Is the coordinate a length?"""
+    units = {s.name: s.unit for s in model.states}
+    return units[site] in _LENGTHS if _mechanical(model) else units[site].removesuffix("/s") in _LENGTHS
+
+
+def _turning(site: str, model: gc.Model) -> bool:
+    """Is the coordinate an angle?"""
+    return {s.name: s.unit for s in model.states}[site] in ("rad", "deg", "1")
+
+
+def tilts(site: str, model: gc.Model) -> bool:
+    """Can gravity be turned along this coordinate: is it a length, or an angle that gravity pulls back?"""
+    return _mechanical(model) and (straight(site, model) or (_turning(site, model) and _weighs(site, model)))
+
+
+def _weighs(site: str, model: gc.Model) -> bool:
+    """Does a resting coordinate of a _mechanical model feel a force that depends on its place?"""
+    if not _section(model, "bodies") and not any(site in _words(str(t)) for t in _section(model, "bias").values()):
+        return False
+    n = len(model.coordinates)
+    x = np.zeros((1, model.nx))
+    x[0, :n] = np.linspace(0.3, 0.7, n)
+    return bool(np.any(model.step(x, np.zeros((1, model.nu))).x[0, n:]))
+
+
+def carries(site: str, model: gc.Model) -> bool:
+    """Has the coordinate a `points` entry, where a payload would sit?"""
+    return site in _section(model, "points")
+
+
+def neighbour(site: str, model: gc.Model) -> str | None:
+    """The next coordinate of the same unit, the one before at the end of a chain."""
+    units = {s.name: s.unit for s in model.states}
+    alike = [q for q in model.coordinates if units[q] == units[site]]
+    if not _mechanical(model) or len(alike) < 2:
+        return None
+    i = alike.index(site)
+    return alike[i + 1] if i + 1 < len(alike) else alike[i - 1]
+
+
+def _section(model: gc.Model, *keys: str) -> Mapping[str, object]:
+    spec = model.text()
+    return next((spec[k] for k in keys if spec.get(k)), {})
+
+
+def _words(text: str) -> set[str]:
+    return set(re.findall(r"[^\W\d]\w*", text))
