@@ -13,7 +13,7 @@ _HOME = homes(
         "gapcert_engines.contract": "ABSURD BodyInertia Drive Engine EngineWorld Joint JointType Motor Thruster",
         "gapcert_engines.equations_model": "PHYSICAL EngineModel",
         "gapcert_engines.native_model": "Group NativeModel",
-        "gapcert_engines.robot.description": "RobotDescription chosen_model",
+        "gapcert_engines.robot.description": "RobotDescription chosen_model read_robot",
         "gapcert_engines.robot.links": "Link as_section largest_moment moments",
         "gapcert_engines.robot.patch": "RobotText patched_file patched_sdf patched_urdf setting_code",
         "gapcert_engines.robot.shapes": "file_shapes",

@@ -17,6 +17,7 @@ from gapcert_engines.native_model import Group as Group
 from gapcert_engines.native_model import NativeModel as NativeModel
 from gapcert_engines.robot.description import RobotDescription as RobotDescription
 from gapcert_engines.robot.description import chosen_model as chosen_model
+from gapcert_engines.robot.description import read_robot as read_robot
 from gapcert_engines.robot.links import Link as Link
 from gapcert_engines.robot.links import as_section as as_section
 from gapcert_engines.robot.links import largest_moment as largest_moment
