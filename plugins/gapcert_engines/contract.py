@@ -201,7 +201,8 @@ class Engine(ABC):
     `EngineWorld.set` takes, with the stated values; motors: at most one per joint; thrusters: those that inputs name; rowwise:
     its worlds take native parameters row by row as well, `EngineWorld.set_rows`, so that queries which differ in them share a
     batch; unsolved: the change of a state per second that a solver of constraints may leave undone; forgets: nothing of a query
-    reaches the last bit of those after it; integrator, friction_after: of `section`, where dry friction does not feel damping.
+    reaches the last bit of those after it; integrator: of its equations, see `as_section`; friction_after: their dry friction
+    does not feel damping that is solved with the step.
     """
 
     config: EngineConfig

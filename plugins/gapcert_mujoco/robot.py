@@ -100,7 +100,7 @@ def thrusters(model: Any) -> tuple[Thruster, ...]:
 
 
 def motors(path: Path) -> tuple[Motor, ...]:
-    """Those that are alone at a hinge or slide, with a gear; one without a name has its joint's."""
+    """Of the file: those that are alone at a hinge or slide, with a gear; one without a name has its joint's."""
     spec = mujoco.MjSpec.from_file(str(path))
     if not list(spec.actuators):
         return ()
