@@ -173,7 +173,7 @@ def _joint(model: Any, k: int, kind: Any) -> Joint:
 
 
 def _implicit(model: Any) -> bool:
-    """Is the damping of joints solved with the step?"""
+    """Is the damping D of joints solved with the step, (M + h D) a = forces − D v, as Euler and implicitfast do?"""
     if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
         return False
     return not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP) or (

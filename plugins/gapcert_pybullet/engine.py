@@ -64,8 +64,8 @@ class PyBulletEngine(Engine):
     ) -> dict[str, Any] | None:
         """See Engine.section; with Bullet's drag.
 
-        It holds every link back by m v k (1 + |v|) at its centre of mass, and by I ω l (1 + |ω|), with k its linear and l its
-        angular damping (btMultiBody).
+        Bullet takes damping from the velocity at the beginning of a step. Its drag holds every link back by m v k (1 + |v|) at
+        its centre of mass, and by I ω l (1 + |ω|), with k its linear and l its angular damping (btMultiBody).
         """
         out, drag = super().section(coordinates, period, free, values), {}
         if out is None:
@@ -114,7 +114,7 @@ class PyBulletEngine(Engine):
         if any(name.startswith("coulomb_friction.") for name in unsaid):
             code += _STRENGTH
         setters = _SETTERS
-        if time := unsaid.get("contact_time"):
+        if time := float(unsaid.get("contact_time", 0.0)):
             mass = sum(v for n, v in self.stated.items() if n.startswith("mass."))
             spring = f"contactStiffness={mass / time**2!r}, contactDamping={2 * mass / time!r}"
             setters = _SETTERS | {"contact_time": _EVERY % spring}

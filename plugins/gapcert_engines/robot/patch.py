@@ -1,4 +1,4 @@
-"""Native parameters written into URDF and SDF files: nothing else of their text changes, comments and layout included."""
+"""Numbers written into robot files, native parameters into URDF and SDF: nothing else changes, comments and layout included."""
 
 from __future__ import annotations
 
