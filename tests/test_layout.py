@@ -145,7 +145,7 @@ def test_import_contracts_hold(sources):
     ("file", "line", "contract"),
     [
         ("plugins/gapcert_bounds/__init__.py", "import gapcert_effects", "packages stand in layers"),
-        ("plugins/gapcert_engines/drive.py", "import gapcert_mujoco", "packages stand in layers"),
+        ("plugins/gapcert_engines/contract.py", "import gapcert_mujoco", "packages stand in layers"),
         ("core/gapcert/contracts/plugins/events.py", "def late():\n    import gapcert_bounds", "packages stand in layers"),
         ("core/gapcert/numerics/texts.py", "def late():\n    import gapcert.spec.spec", "the core has rooms"),
     ],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, final
@@ -12,15 +12,12 @@ import numpy as np
 
 from gapcert import Array, Parameter
 from gapcert.plugin import Scene
-from gapcert_engines import Drive, Engine, Joint, as_backend, as_section, file_shapes
+from gapcert_engines import Drive, Engine, Joint, Link, as_backend, file_shapes, moments, patched_file, setting_code
 
 from .config import DartConfig
 from .loader import joints, load
-from .patch import files
 from .robot import RobotFile
-from .rotation import to_vector
-from .section import links
-from .world import GRAVITY, DartWorld, inertia, moving_bodies, restitution
+from .world import GRAVITY, DartWorld, inertia, moving_bodies, restitution, to_vector
 
 _COORDINATES_AT_MOST = 256
 """Of all copies: beyond, a step costs more per copy, and a skeleton takes seconds to build."""
@@ -33,6 +30,8 @@ class DartEngine(Engine):
     frame is along that of its joint) and, where the robot can touch something, `friction` and `restitution` of its shapes (the
     latter where all have the same) and friction `ground` of the ground.
     """
+
+    friction_after = True
 
     def __init__(self, config: DartConfig, folder: Path | None = None) -> None:
         self.config: DartConfig = config
@@ -56,19 +55,11 @@ class DartEngine(Engine):
     def digest_data(self) -> list[object]:
         return [importlib.metadata.version("dartpy"), self.robot.digest()]
 
-    def section(
-        self, coordinates: Sequence[str], period: float, free: Mapping[str, str], values: Mapping[str, float]
-    ) -> dict[str, Any] | None:
-        config = self.config
-        skeleton = load(self.robot, fixed_base=config.fixed_base)
-        if self.base or config.drive or config.touches:
+    def links(self, coordinates: Mapping[str, str], period: float, values: Mapping[str, float]) -> list[Link] | None:
+        if self.config.touches:
             return None
-        named = dict(zip((j.name for j in self.joints if j.movable), coordinates, strict=True))
-        found = links(skeleton, named, config.joint_damping, config.coulomb_friction)
-        stated = {p.name: p.value for p in self.parameters}
-        found = [replace(link, moment=stated.get(f"inertia.{link.name}")) for link in found]
-        x, y, z = (p.value for p in self.parameters[:3])
-        return as_section(found, (x, y, z), free, implicit=True, after=True)
+        bodies = load(self.robot, fixed_base=self.config.fixed_base).getBodyNodes()
+        return [_link(body, coordinates, self.stated) for body in bodies]
 
     def implicit(self) -> bool:
         return True
@@ -78,7 +69,24 @@ class DartEngine(Engine):
         return 1e-7 if self.rubs(values) else super().accuracy(values)
 
     def patched(self, values: Mapping[str, float]) -> dict[str, str]:
-        return files(self.robot, self.config, values, {p.name: p.value for p in self.parameters})
+        config, stated = self.config, self.stated
+        given = {"damping": config.joint_damping, "coulomb_friction": config.coulomb_friction}
+        words = {"damping": "damping", "coulomb_friction": "friction"}
+        text = self.robot.path.read_text(encoding="utf-8")
+        patched, unsaid = patched_file(text, values, stated, words, given, config.model)
+        code = {"extended.py": self._code(unsaid, stated | dict(values))} if unsaid else {}
+        return patched | code
+
+    def _code(self, unsaid: Mapping[str, float], values: Mapping[str, float]) -> str:
+        """Code that loads the file into a world, as this package does, and sets what the file cannot say."""
+        loader = _URDF if self.robot.kind == "urdf" else _SDF
+        gravity = ", ".join(repr(float(values[f"gravity_{a}"])) for a in "xyz")
+        lines = [
+            *("from pathlib import Path", "", "import dartpy", "import numpy as np"),
+            loader.format(root="FIXED" if self.config.fixed_base else "FLOATING").rstrip(),
+            *("world = dartpy.simulation.World()", "world.addSkeleton(robot)", f"world.setGravity({gravity})"),
+        ]
+        return "\n".join([*lines, *setting_code(_SETTERS, unsaid), ""])
 
     def scene(self, position: Array, base: Array | None) -> Scene:
         skeleton = load(self.robot, fixed_base=self.config.fixed_base)
@@ -138,6 +146,37 @@ def _body(body: Any) -> list[Parameter]:
     return (own if (turn == np.eye(3)).all() else replace(own, centre=())).parameters()
 
 
+def _link(body: Any, coordinates: Mapping[str, str], stated: Mapping[str, float]) -> Link:
+    """In the frame of its joint, of which DART knows where it is in both of its bodies."""
+    joint, parent = body.getParentJoint(), body.getParentBodyNode()
+    frame = joint.getTransformFromChildBodyNode()
+    above = joint.getTransformFromParentBodyNode()
+    if parent is not None:
+        above = parent.getParentJoint().getTransformFromChildBodyNode().inverse().multiply(above)
+    own, turn, back = body.getInertia(), np.asarray(frame.rotation()).T, frame.inverse()
+    origin = np.asarray(back.translation())
+    name, moves = joint.getName(), joint.getNumDofs() > 0
+    return Link(
+        body.getName(),
+        None if parent is None else parent.getName(),
+        tuple(above.translation().tolist()),
+        tuple(above.quaternion().wxyz().tolist()),
+        coordinates[name] if moves else None,
+        name,
+        joint.getType() == "PrismaticJoint",
+        tuple(joint.getAxis().tolist()) if moves else (0.0, 0.0, 1.0),
+        float(own.getMass()),
+        tuple((turn @ np.asarray(own.getLocalCOM()) + origin).tolist()),
+        moments(turn @ np.asarray(own.getMoment()) @ turn.T),
+        damping=stated.get(f"damping.{name}"),
+        dry=stated.get(f"coulomb_friction.{name}"),
+        stiffness=float(joint.getSpringStiffness(0)) if moves else 0.0,
+        rest=float(joint.getRestPosition(0)) if moves else 0.0,
+        origin=tuple(origin.tolist()),
+        moment=stated.get(f"inertia.{body.getName()}"),
+    )
+
+
 def enforced(config: DartConfig, native: Any) -> bool:
     """Does this joint stop at its limits?"""
     return bool(native.areLimitsEnforced()) if config.joint_limits is None else config.joint_limits
@@ -155,3 +194,34 @@ def _ended(config: DartConfig, joint: Joint, native: Any) -> Joint:
 def _base(skeleton: Any) -> tuple[float, ...]:
     place = skeleton.getRootBodyNode(0).getWorldTransform()
     return (*place.translation().tolist(), *place.quaternion().wxyz().tolist(), *(0.0,) * 6)
+
+
+_URDF = """
+massless = dartpy.dynamics.Inertia(0.0, np.zeros(3), np.zeros((3, 3)))
+kind = dartpy.utils.DartLoaderRootJointType.{root}
+loader = dartpy.utils.DartLoader()
+loader.setOptions(dartpy.utils.DartLoaderOptions(None, kind, massless))
+robot = loader.parseSkeleton(str(Path("extended.urdf").resolve()))
+"""
+_SDF = """
+kind = dartpy.utils.SdfParser.RootJointType.{root}
+robot = dartpy.utils.SdfParser.readSkeleton(str(Path("extended.sdf").resolve()), dartpy.utils.SdfParser.Options(None, kind))
+"""
+_OWN = """body = robot.getBodyNode("{element}")
+own = body.getInertia()
+"""
+_INERTIA = f"""{_OWN}centre, moment = np.array(own.getLocalCOM()), np.array(own.getMoment())
+%s
+body.setInertia(dartpy.dynamics.Inertia(own.getMass(), centre, moment))"""
+_SETTERS = {
+    "damping": 'robot.getJoint("{element}").setDampingCoefficient(0, {number})',
+    "coulomb_friction": 'robot.getJoint("{element}").setCoulombFriction(0, {number})',
+    "mass": f"{_OWN}body.setInertia(dartpy.dynamics.Inertia({{number}}, own.getLocalCOM(), "
+    "own.getMoment() * {number} / own.getMass()))",
+    "inertia": _INERTIA % "moment *= {number}",
+    **{f"com_{a}": _INERTIA % f"centre[{k}] = {{number}}" for k, a in enumerate("xyz")},
+    "friction": """for body in robot.getBodyNodes():
+    for k in range(body.getNumShapeNodes()):
+        body.getShapeNode(k).getDynamicsAspect(True).setFrictionCoeff({number})""",
+    "ground": "# The ground that the robot stands on has the friction {number}.",
+}

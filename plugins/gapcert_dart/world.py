@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, final
 
 import numpy as np
@@ -11,15 +11,14 @@ from gapcert import Array, UsageError
 from gapcert_engines import ABSURD, BodyInertia, Drive, EngineWorld
 
 from .config import DartConfig
-from .driving import Driver
 from .loader import dartpy, joints, load
 from .robot import RobotFile
-from .rotation import from_vector, to_vector
 
 GRAVITY = tuple(float(g) for g in dartpy.simulation.World().getGravity())
 """DART's own, m/s²."""
 GROUND_SIZE = (1000.0, 1000.0, 10.0)
 """m; a box, because DART finds all corners of a box on a box, and one on a plane."""
+_AHEAD = (1.0, 0.0, 0.0, 0.0)
 
 
 @final
@@ -44,7 +43,7 @@ class DartWorld(EngineWorld):
             joint.setLimitEnforcement(config.joint_limits)
         self.world, self._ground = _simulation(config, self.skeleton)
         self.world.setTimeStep(period / self.substeps)
-        self._drive = None if drive is None else Driver(drive, self.skeleton, self._joints, floats=not config.fixed_base)
+        self._drive = None if drive is None else _Driver(drive, self.skeleton, self._joints, floats=not config.fixed_base)
         self._values: Mapping[str, float] = {}
 
     def close(self) -> None:
@@ -130,6 +129,62 @@ class DartWorld(EngineWorld):
                 f"DartWorld: the state has run away one period after positions {start}; expected a stable simulation; "
                 f"use more substeps or a smaller domain"
             )
+
+
+@final
+class _Driver:
+    """Without a gain the joints get DART's servo motor within the limit, or its velocity motor, which has none."""
+
+    def __init__(self, drive: Drive, skeleton: Any, joints: Sequence[Any], *, floats: bool) -> None:
+        self.drive, self.skeleton = drive, skeleton
+        names = [j.getName() for j in joints]
+        self._columns = [names.index(element) for element in drive.elements]
+        self._dofs = [joints[k].getIndexInSkeleton(0) for k in self._columns]
+        self._base = skeleton.getRootBodyNode(0) if floats and drive.feeds_back else None
+        if drive.gain is None:
+            for k in self._columns:
+                self._motor(joints[k])
+
+    def check(self, effort: Array) -> None:
+        """Refuses forces on a joint that follows DART's own motor, which would pass over them."""
+        if self.drive.gain is None and (pushed := effort[:, :, self._columns].any(axis=(0, 1))).any():
+            name = self.drive.elements[int(np.argmax(pushed))]
+            raise UsageError(
+                f"DartWorld: joint '{name}' follows DART's own motor, which takes no force; give the drive a gain and a limit"
+            )
+
+    def run(self, world: Any, efforts: Array, command: Array, substeps: int) -> None:
+        """All sub-steps of one period under efforts (1 or substeps, dofs)."""
+        skeleton, drive, target = self.skeleton, self.drive, command
+        for k in range(substeps):
+            if k % drive.every == 0:
+                target = self._targets(command)
+            effort = efforts[k if len(efforts) > 1 else 0]
+            if drive.gain is None:
+                skeleton.setForces(effort)
+                for dof, rate in zip(self._dofs, target.tolist(), strict=True):
+                    skeleton.setCommand(dof, rate)
+            else:
+                effort = effort.copy()
+                effort[self._dofs] += drive.effort(target, skeleton.getVelocities()[self._dofs])
+                skeleton.setForces(effort)
+            world.step(False)
+
+    def _targets(self, command: Array) -> Array:
+        if self._base is None:
+            return self.drive.targets(command, _AHEAD, 0.0)
+        rotation = self._base.getWorldTransform().quaternion().wxyz()
+        return self.drive.targets(command, rotation.tolist(), float(self._base.getAngularVelocity()[2]))
+
+    def _motor(self, joint: Any) -> None:
+        limit = self.drive.limit
+        kinds = dartpy.dynamics.ActuatorType
+        joint.setActuatorType(kinds.VELOCITY if limit is None else kinds.SERVO)
+        # DART would cut the command to the file's limits without a word.
+        joint.setVelocityLowerLimit(0, -np.inf)
+        joint.setVelocityUpperLimit(0, np.inf)
+        joint.setForceLowerLimit(0, -np.inf if limit is None else -limit)
+        joint.setForceUpperLimit(0, np.inf if limit is None else limit)
 
 
 def _simulation(config: DartConfig, skeleton: Any) -> tuple[Any, Any]:
@@ -240,3 +295,21 @@ def _moment(body: Any) -> Array:
 
 def _blocks(items: list[Any], size: int) -> list[list[Any]]:
     return [items[k : k + size] for k in range(0, len(items), size)]
+
+
+def to_vector(rotation: Array) -> Array:
+    """Quaternions (n, 4), of any length, → axes times angles in [0, π] (n, 3); no row's bits depend on its neighbours."""
+    w, x, y, z = rotation.T
+    sign = np.where(w < 0, -1.0, 1.0)
+    norm = np.sqrt(x * x + y * y + z * z)
+    angle = 2 * np.arctan2(norm, np.abs(w))
+    scale = sign * np.divide(angle, norm, out=np.full_like(norm, 2.0), where=norm > 0)
+    return np.stack([scale * x, scale * y, scale * z], axis=1)
+
+
+def from_vector(vector: Array) -> Array:
+    """(n, 3) → (n, 4) with w ≥ 0 up to an angle of π."""
+    x, y, z = vector.T
+    angle = np.sqrt(x * x + y * y + z * z)
+    scale = np.divide(np.sin(angle / 2), angle, out=np.full_like(angle, 0.5), where=angle > 0)
+    return np.stack([np.cos(angle / 2), scale * x, scale * y, scale * z], axis=1)

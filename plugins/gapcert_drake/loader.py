@@ -68,6 +68,11 @@ class Loaded:
         found = (self.plant.get_joint_actuator(a) for a in self.plant.GetJointActuatorIndices())
         return next(a for a in found if int(a.joint().index()) == int(joint.index()))
 
+    def armature(self, joint: Any) -> float:
+        """Inertia of the rotor as the joint feels it."""
+        actuator = self.actuator(joint)
+        return float(actuator.default_rotor_inertia() * actuator.default_gear_ratio() ** 2)
+
 
 def load(
     robot: RobotFile, config: DrakeConfig, copies: int, step: float, gravity: Sequence[float] | None, ground: float | None

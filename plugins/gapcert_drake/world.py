@@ -15,7 +15,6 @@ from gapcert_engines import ABSURD, BodyInertia, Drive, EngineWorld
 from .config import FIXED_STEP, DrakeConfig
 from .loader import Loaded, listening, load
 from .robot import RobotFile
-from .section import central
 
 
 @final
@@ -143,17 +142,15 @@ class DrakeWorld(EngineWorld):
     def _driven(self, k: int, force: Array, command: Array, state: Array, targets: Any) -> tuple[Array, Any]:
         """The effort with the drive's, and the rates that it is after."""
         drive, nq = self.drive, self.loaded.plant.num_positions()
-        assert drive is not None
-        assert drive.gain is not None
+        assert drive is not None, "commands go to a drive"
         names = [j.name() for j in self._joints[0]]
         at = self._v[[names.index(e) for e in drive.elements]]
         if k % drive.every == 0:
             q, v = self._base
             turn = (state[q : q + 4] / np.linalg.norm(state[q : q + 4])).tolist() if drive.feeds_back else (1.0, 0.0, 0.0, 0.0)
             targets = drive.targets(command, turn, float(state[nq + v + 2]) if drive.feeds_back else 0.0)
-        limit = np.inf if drive.limit is None else drive.limit
         row = force.copy()
-        row[at] += np.clip(drive.gain * (targets - state[nq + at]), -limit, limit)
+        row[at] += drive.effort(targets, state[nq + at])
         return row, targets
 
     def _weigh(self, body: Any, values: Mapping[str, float]) -> None:
@@ -174,6 +171,12 @@ class DrakeWorld(EngineWorld):
             f"DrakeWorld: one period after positions {start}: {' '.join(reason.split())}; expected a stable simulation; use "
             f"more substeps or a smaller domain"
         )
+
+
+def central(spatial: Any) -> Array:
+    """The inertia (3, 3) about the centre of mass, along the axes of the body."""
+    found = spatial.Shift(spatial.get_com()).CalcRotationalInertia().CopyToFullMatrix3()
+    return np.asarray(found, dtype=np.float64)
 
 
 def body_inertia(body: Any) -> BodyInertia:

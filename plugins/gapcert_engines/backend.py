@@ -46,7 +46,7 @@ class EngineBackend(Backend):
         self.parameters = (*engine.parameters, *gears)
         able: dict[Capability, object] = {"parameters": self.parameters, "hidden": self.hidden, "forces": self.coordinates}
         self.capabilities = frozenset(name for name, what in able.items() if what)
-        self._nominal = self._asked = {p.name: p.value for p in engine.parameters}
+        self._nominal = self._asked = engine.stated
 
     @property
     def tiling(self) -> str:

@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from gapcert.plugin import Array, Parameter, Scene, StateSpec, UsageError
 
-from .config import EngineConfig
-from .drive import Drive
+from .config import FEEDBACK, DriveConfig, EngineConfig
+from .robot.links import NATIVE, NATIVE_UNITS, Link, as_section
 
 JointType = Literal["revolute", "prismatic", "fixed", "ball", "planar", "free", "other"]
 
@@ -24,15 +24,7 @@ BASE = (*_PLACE, StateSpec("base.rotation", "1", "quaternion"), *_MOTION)
 BASE_EULER = (*_PLACE, *(StateSpec(f"base.{a}", "rad", "angle") for a in ("roll", "pitch", "yaw")), *_MOTION)
 """The same with rotation = turns about the fixed axes x, y, z in this order."""
 
-
 ENDLESS = (-float("inf"), float("inf"))
-NATIVE = {"viscous-friction": ("damping",), "coulomb-friction": ("frictionloss", "coulomb_friction")}
-"""What engines call the parameters that realise effects at a joint, `KIND.JOINT`."""
-NATIVE_UNITS = {
-    False: {"damping": "N*m*s/rad", "dry": "N*m", "armature": "kg*m^2", "stiffness": "N*m/rad", "rest": "rad"},
-    True: {"damping": "N*s/m", "dry": "N", "armature": "kg", "stiffness": "N/m", "rest": "m"},
-}
-"""Of what joints have, by whether they slide."""
 ABSURD = 1e100
 """No position or velocity of a robot, in any unit; its square is still finite."""
 LIGHTEST = 1e-9
@@ -123,6 +115,55 @@ class BodyInertia:
         return self.mass / stated.mass * (self.moment / stated.moment if self.moment != stated.moment else 1.0)
 
 
+@final
+@dataclass(frozen=True)
+class Drive:
+    """target (m,) = mixing (m, nu) · commands + yaw · heading + yaw_rate · turning rate; see DriveConfig."""
+
+    elements: tuple[str, ...]
+    mixing: Array
+    yaw: Array
+    yaw_rate: Array
+    gain: float | None
+    limit: float | None
+    every: int
+
+    @classmethod
+    def of(cls, config: DriveConfig, inputs: Sequence[str]) -> Drive:
+        """With the columns of `mixing` in the order of `inputs`."""
+
+        def column(name: str) -> list[float]:
+            return [row.get(name, 0.0) for row in config.elements.values()]
+
+        mixing = np.array([column(name) for name in inputs]).reshape(len(inputs), -1).T
+        yaw, rate = (np.array(column(name)) for name in FEEDBACK)
+        return cls(tuple(config.elements), mixing, yaw, rate, config.gain, config.limit, config.every)
+
+    @property
+    def feeds_back(self) -> bool:
+        return bool(self.yaw.any() or self.yaw_rate.any())
+
+    def commands(self, u: Array) -> Array:
+        """mixing · u, (n, nu) → (n, m), summed input by input: a matrix product's bits depend on the batch."""
+        out = np.zeros((len(u), len(self.elements)))
+        for j in range(u.shape[1]):
+            out += u[:, j : j + 1] * self.mixing[:, j]
+        return out
+
+    def targets(self, command: Array, rotation: Sequence[Array | float], turning: Array | float) -> Array:
+        """Rates (m,) or (n, m) from `command` = mixing · inputs of that shape, the base's rotation (w, x, y, z) and rate about
+        the vertical: numbers, or n of each."""
+        w, x, y, z = (np.asarray(part) for part in rotation)
+        heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        return np.asarray(command + self.yaw * heading[..., None] + self.yaw_rate * np.asarray(turning)[..., None])
+
+    def effort(self, targets: Array, rates: Array) -> Array:
+        """clip(gain · (targets − rates), ±limit) of a drive with a gain."""
+        assert self.gain is not None, "without a gain the engine's own rate motors follow"
+        limit = np.inf if self.limit is None else self.limit
+        return np.clip(self.gain * (targets - rates), -limit, limit)
+
+
 class EngineWorld(ABC):
     """`copies` of a robot in one simulation, advanced together; holds native objects, so it is never pickled."""
 
@@ -160,7 +201,8 @@ class Engine(ABC):
     `EngineWorld.set` takes, with the stated values; motors: at most one per joint; thrusters: those that inputs name; rowwise:
     its worlds take native parameters row by row as well, `EngineWorld.set_rows`, so that queries which differ in them share a
     batch; unsolved: the change of a state per second that a solver of constraints may leave undone; forgets: nothing of a query
-    reaches the last bit of those after it.
+    reaches the last bit of those after it; integrator: of its equations, see `as_section`; friction_after: their dry friction
+    does not feel damping that is solved with the step.
     """
 
     config: EngineConfig
@@ -173,6 +215,8 @@ class Engine(ABC):
     rowwise: bool = False
     unsolved: float = 0.0
     forgets: bool = True
+    integrator: str = "semi_implicit"
+    friction_after: bool = False
 
     @abstractmethod
     def open(self, copies: int, period: float, drive: Drive | None) -> EngineWorld:
@@ -182,6 +226,11 @@ class Engine(ABC):
     def digest_data(self) -> list[object]:
         """JSON-able: the engine's version and everything in the files that determines the answers (the config is added)."""
 
+    @property
+    def stated(self) -> dict[str, float]:
+        """Native parameters as the files and the spec have them."""
+        return {p.name: p.value for p in self.parameters}
+
     @staticmethod
     def gravity_parameters(gravity: Sequence[float]) -> tuple[Parameter, ...]:
         """`gravity_x`, `_y` and `_z`."""
@@ -189,8 +238,8 @@ class Engine(ABC):
 
     @staticmethod
     def joint_parameter(kind: str, joint: Joint, own: float, given: float | None = None) -> Parameter:
-        """`damping.JOINT`, `coulomb_friction.JOINT` or `armature.JOINT`: its own, unless a spec has given one to all joints."""
-        unit = NATIVE_UNITS[joint.type == "prismatic"]["dry" if kind == "coulomb_friction" else kind]
+        """`KIND.JOINT`, of damping, dry friction or armature: its own, unless a spec has given one to all joints."""
+        unit = NATIVE_UNITS[joint.type == "prismatic"]["dry" if kind in NATIVE["coulomb-friction"] else kind]
         return Parameter(f"{kind}.{joint.name}", own if given is None else given, unit, low=0.0)
 
     def check_mass(self, matrix: Array, mover: Callable[[int], str]) -> None:
@@ -221,6 +270,17 @@ class Engine(ABC):
         None where more than a tree of bodies acts. coordinates: of the movable joints; free: native parameters → names of
         parameters that stand for their numbers; values: those of native parameters that are not the file's.
         """
+        if self.base or self.config.drive:
+            return None
+        named = dict(zip((j.name for j in self.joints if j.movable), coordinates, strict=True))
+        if (links := self.links(named, period, values)) is None:
+            return None
+        x, y, z = (self.stated[f"gravity_{a}"] for a in "xyz")
+        how: dict[str, Any] = {"after": self.friction_after, "integrator": self.integrator}
+        return as_section(links, (x, y, z), free, implicit=self.implicit(), **how)
+
+    def links(self, coordinates: Mapping[str, str], period: float, values: Mapping[str, float]) -> list[Link] | None:
+        """What `section` writes, None where it writes nothing; coordinates: joint → coordinate."""
         return None
 
     def implicit(self) -> bool:

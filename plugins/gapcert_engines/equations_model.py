@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partialmethod
@@ -10,21 +11,24 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from gapcert import Array, Context, Model, Parameter, UsageError, registry
-from gapcert.plugin import Extension, Scene, Variant, difference
+from gapcert import Array, Context, Model, Parameter, StateSpec, UsageError, registry
+from gapcert.plugin import Extension, Scene, Variant, difference, site_units
 from gapcert_engines.thresholds import THRESHOLDS
 
 from .backend import EngineBackend
 from .config import EngineConfig
+from .contract import Engine
 from .native_model import NativeModel, in_contact
-from .probes import probes
 from .settings import changed, declared, flat, short
-from .uncertain_parameters import DAMPING, doubted, felt, known, plain_name, scales
 from .wiring import hint
 
 if TYPE_CHECKING:
     from .model_config import EngineModelConfig
 
+DAMPING = "implicit_damping"
+"""Of a model, instead of the engine's: whether damping that a diagnosis finds is solved with the step."""
+DOUBTED = ("mass", "armature")
+"""Native parameters that may be wrong though no tolerance is stated; of gravity, the components that are not zero."""
 BESIDE = "not_in_the_file.txt"
 PHYSICAL = {"joint_damping", "coulomb_friction", "frictionloss", "armature", "gravity", "friction", "restitution"}
 """Options that are native parameters of joints and contacts: causes of their own."""
@@ -65,17 +69,17 @@ class EngineModel(Model):
         like: Model | None,
     ) -> None:
         self.backend, self.otherwise = backend, dict(otherwise or {})
-        given, every = {p.name for p in parameters}, known(backend)
-        loose = [p for p in every.values() if p.name not in given and doubted(p)]
+        given, every = {p.name for p in parameters}, _native_parameters(backend)
+        loose = [p for p in every.values() if p.name not in given and _doubted(p)]
         there = {p.name for p in backend.parameters}
-        self._stated = {plain_name(p): p.name for p in (*parameters, *loose)}
+        self._stated = {_plain_name(p): p.name for p in (*parameters, *loose)}
         self._lacking = {name: native for name, native in self._stated.items() if native not in there}
         self._added: dict[str, str] = {}
         self._others: tuple[Extension, ...] = ()
         free = {native: name for name, native in self._stated.items()}
         self._adopt(_written(backend, free, (*parameters, *loose), self.otherwise, like))
         self.within = backend.ranges()
-        self.doubts = scales(self.inner, loose, {j.name: q for j, q in backend.moved()})
+        self.doubts = _scales(self.inner, loose, {j.name: q for j, q in backend.moved()})
 
     def beside(
         self, backend: EngineBackend, parameters: Sequence[Parameter], otherwise: Mapping[str, Any] | None = None
@@ -116,7 +120,7 @@ class EngineModel(Model):
         if self.otherwise:
             return
         without = dict.fromkeys(self._lacking, np.zeros(THRESHOLDS.engine_probes))
-        x, u, own = probes(self.inner, self.within, THRESHOLDS.engine_probes, without or None)
+        x, u, own = _probes(self.inner, self.within, THRESHOLDS.engine_probes, without or None)
         order = [[s.name for s in self.backend.states].index(s.name) for s in self.states]
         at = np.empty_like(x)
         at[:, order] = x
@@ -181,7 +185,7 @@ class EngineModel(Model):
         return bool(self.otherwise.get(DAMPING, own))
 
     def restated(self, values: Mapping[str, float]) -> EngineModel:
-        stated, own = known(self.backend), {p.name: p for p in self.parameters}
+        stated, own = _native_parameters(self.backend), {p.name: p for p in self.parameters}
         parameters = [
             replace(stated[native], value=values.get(n, own[n].value), tolerance=own[n].tolerance)
             for n, native in self._stated.items()
@@ -202,7 +206,7 @@ class EngineModel(Model):
 
     def stated(self) -> list[Parameter]:
         """Native parameters that a spec has given a value or a tolerance, as the engine calls them."""
-        stated, own = known(self.backend), {p.name: p for p in self.parameters}
+        stated, own = _native_parameters(self.backend), {p.name: p for p in self.parameters}
         return [
             replace(stated[native], value=own[n].value, tolerance=own[n].tolerance)
             for n, native in self._stated.items()
@@ -244,6 +248,84 @@ class EngineModel(Model):
             for n, native in self._lacking.items()
             if own[n].value
         ]
+
+
+def _native_parameters(backend: EngineBackend) -> dict[str, Parameter]:
+    """The engine's native parameters, and inertia of joints that it has none of: only the equations know that."""
+    out = {p.name: p for p in backend.parameters}
+    for joint, _ in backend.moved():
+        none = Engine.joint_parameter("armature", joint, 0.0)
+        out.setdefault(none.name, none)
+    return out
+
+
+def _plain_name(p: Parameter) -> str:
+    return re.sub(r"\W", "_", p.name)
+
+
+def _doubted(p: Parameter) -> bool:
+    what = p.name.partition(".")[0]
+    return what in DOUBTED or (what.startswith("gravity_") and p.value != 0)
+
+
+def _scales(model: Model, parameters: Sequence[Parameter], coordinates: Mapping[str, str]) -> dict[str, float]:
+    """What change of a native parameter matters: its value, or the inertia that its joint feels where that is zero."""
+    out = {}
+    for p in parameters:
+        what, _, joint = p.name.partition(".")
+        out[_plain_name(p)] = abs(p.value) or (_felt(model, coordinates[joint]) if what == "armature" else 1.0)
+    return out
+
+
+def _felt(model: Model, q: str) -> float:
+    """M⁻¹ of a coordinate at rest in zero, inverted."""
+    push = Parameter("probe_force", 0.0, site_units(model, "coordinate", q)["force"])
+    pushed = model.extend([Extension("probe", q, (push,), force=push.name)])
+    x, u = np.zeros((1, model.nx)), np.zeros((1, model.nu))
+    column = [s.name for s in model.states].index(f"{q}_dot")
+    # Far more than dry friction holds.
+    on, off = (
+        pushed.step(x, u, parameters={push.name: np.array([f])}).x[0, column]
+        for f in (2 * THRESHOLDS.strong_push, THRESHOLDS.strong_push)
+    )
+    return float(model.period * THRESHOLDS.strong_push / abs(on - off))
+
+
+def _probes(
+    model: Model, within: Mapping[str, tuple[float, float]], n: int, parameters: Mapping[str, Array] | None
+) -> tuple[Array, Array, Array]:
+    """x (n, nx), positions before velocities, and u (n, nu): normal, and in the middle of a range where there is one; and x⁺.
+
+    UsageError where steps leave the ranges from however slow a motion.
+    """
+    rng = np.random.default_rng(0)
+    (low, high), ends = _ends(model.states, within), _ends(model.inputs, within)
+    x, u = _inside(rng.normal(size=(n, model.nx)), low, high), _inside(rng.normal(size=(n, model.nu)), *ends)
+    for _ in range(THRESHOLDS.probe_tries):
+        after = model.step(x, u, parameters=parameters).x
+        gone = (after <= low) | (after >= high)
+        if not gone.any():
+            return x, u, after
+        x[gone.any(axis=1), model.nx // 2 :] *= THRESHOLDS.probe_calmer
+        u[gone.any(axis=1)] *= THRESHOLDS.probe_calmer
+    name = model.states[int(np.argmax(gone.sum(axis=0)))].name
+    raise UsageError(
+        f"model.of: one step takes {name} out of {within[name][0]:.6g} to {within[name][1]:.6g}, from wherever it starts at "
+        f"rest; expected a joint with room to move; fix it in the file, or take its limits out"
+    )
+
+
+def _ends(specs: Sequence[StateSpec], within: Mapping[str, tuple[float, float]]) -> tuple[Array, Array]:
+    pairs = np.array([within.get(s.name, (-np.inf, np.inf)) for s in specs]).reshape(-1, 2)
+    return pairs[:, 0], pairs[:, 1]
+
+
+def _inside(z: Array, low: Array, high: Array) -> Array:
+    """Standard normal numbers, squeezed into the middle four fifths of at most `probe_range` of a range, as near zero as it
+    goes."""
+    width = np.minimum(high - low, THRESHOLDS.probe_range)
+    bounded = np.isfinite(low) | np.isfinite(high)
+    return np.where(bounded, np.clip(0.0, low + width / 2, high - width / 2) + 0.4 * width * np.tanh(z), z)
 
 
 def _told(e: Extension) -> str:
@@ -331,7 +413,7 @@ def _options(model: EngineModel) -> Iterator[Variant]:
             # One copy: to see whether more would give the same bits costs more than they would gain here.
             section = changed(config, {**new, **here, "tiles": 1})
             backend = registry().build("backend", config.kind, section, Context())
-            there = known(backend)
+            there = _native_parameters(backend)
             # What an option sets anew is not what the spec has stated of it.
             other = model.beside(backend, [p for p in model.stated() if p.name in there])
             different = other.text() != own
@@ -385,7 +467,7 @@ def _held(model: EngineModel, now: Mapping[str, Any]) -> Iterator[tuple[str, Any
     else:
         rate = 2 / (STIFFEST * CONSTANT)
         soft = {
-            q: {"compliance": (1 - IMPEDANCE) / IMPEDANCE / felt(model.inner, q), "rate": rate}
+            q: {"compliance": (1 - IMPEDANCE) / IMPEDANCE / _felt(model.inner, q), "rate": rate}
             for q in model.backend.coordinates
         }
         yield "dry_friction", "soft", "hard", {"soft_friction": soft}

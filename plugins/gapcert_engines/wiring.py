@@ -14,8 +14,7 @@ import numpy.typing as npt
 from gapcert.plugin import Array, Parameter, StateSpec, System, UsageError, magnitude
 
 from .config import FEEDBACK, EngineConfig, seconds
-from .contract import BASE, BASE_EULER, Engine, Joint, Motor, Thruster
-from .drive import Drive
+from .contract import BASE, BASE_EULER, Drive, Engine, Joint, Motor, Thruster
 
 FIELDS = ("position", "velocity")
 CONTROL = ".ctrl"

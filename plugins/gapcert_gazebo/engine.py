@@ -5,17 +5,16 @@ from __future__ import annotations
 import functools
 import hashlib
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, final
+from typing import final
 
 from gapcert import Array, Context, Parameter, UsageError
 from gapcert.plugin import Scene
-from gapcert_engines import BodyInertia, Drive, Engine, EngineBackend, as_section, file_shapes, patched_file
+from gapcert_engines import BodyInertia, Drive, Engine, EngineBackend, Link, file_shapes, patched_file
 
 from .config import GazeboConfig
 from .sdf import Description, world_text
-from .section import links
 from .shim import shim
 from .system import versions
 from .world import GazeboWorld, opened
@@ -27,6 +26,7 @@ class GazeboEngine(Engine):
     proportion; and, where shapes may touch, `friction`, a factor on the friction coefficients of all of them."""
 
     config: GazeboConfig
+    friction_after = True
 
     def __init__(self, config: GazeboConfig, folder: Path | None = None) -> None:
         self.config = config
@@ -66,14 +66,8 @@ class GazeboEngine(Engine):
     def digest_data(self) -> list[object]:
         return [*self._versions, hashlib.sha256(self._text.encode()).hexdigest()]
 
-    def section(
-        self, coordinates: Sequence[str], period: float, free: Mapping[str, str], values: Mapping[str, float]
-    ) -> dict[str, Any] | None:
-        stated = {p.name: p.value for p in self.parameters}
-        named = dict(zip((j.name for j in self.joints if j.movable), coordinates, strict=True))
-        found = None if self.base or self.config.drive or self._found.touches else links(self._found, named, stated)
-        gravity = stated["gravity_x"], stated["gravity_y"], stated["gravity_z"]
-        return None if found is None else as_section(found, gravity, free, implicit=True, after=True)
+    def links(self, coordinates: Mapping[str, str], period: float, values: Mapping[str, float]) -> list[Link] | None:
+        return None if self._found.touches else self._found.links(coordinates, self.stated)
 
     def implicit(self) -> bool:
         return True
@@ -83,10 +77,10 @@ class GazeboEngine(Engine):
         return 1e-7 if self.rubs(values) else super().accuracy(values)
 
     def patched(self, values: Mapping[str, float]) -> dict[str, str]:
-        stated, config = {p.name: p.value for p in self.parameters}, self.config
+        config = self.config
         given = {"damping": config.joint_damping, "coulomb_friction": config.coulomb_friction}
         text = Path(self.file).read_text(encoding="utf-8")
-        patched, unsaid = patched_file(text, values, stated, {}, given, self._found.model)
+        patched, unsaid = patched_file(text, values, self.stated, {}, given, self._found.model)
         code = "".join(f"    {n!r}: {float(v)!r},\n" for n, v in unsaid.items())
         # Gazebo has no Python of its own to load a file with.
         told = f"# What extended.sdf cannot say: give it to step or rollout of the backend.\nparameters = {{\n{code}}}\n"
@@ -95,7 +89,7 @@ class GazeboEngine(Engine):
     def scene(self, position: Array, base: Array | None) -> Scene:
         world = self.open(1, self.config.substeps * 1e-3, None)
         try:
-            world.set({p.name: p.value for p in self.parameters})
+            world.set(self.stated)
             poses = world.poses(position, base, len(self._found.masses))
         finally:
             world.close()

@@ -7,17 +7,12 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, final
+from typing import Any, final
 from xml.parsers import expat
 
 from gapcert import UsageError
-from gapcert_engines import Joint
+from gapcert_engines import Joint, Link
 
-_TYPES: dict[str, Literal["revolute", "prismatic", "fixed"]] = {
-    "revolute": "revolute",
-    "prismatic": "prismatic",
-    "fixed": "fixed",
-}
 _NEVER = 1e15  # larger ones are no limits, as in SDF
 _GROUND = """<model name="gapcert_ground"><static>true</static><link name="plane"><collision name="plane">
 <geometry><plane><normal>0 0 1</normal></plane></geometry>
@@ -91,18 +86,42 @@ class Description:
             tuple(map(tuple, found.get("carried", []))),
         )
 
+    def links(self, coordinates: Mapping[str, str], stated: Mapping[str, float]) -> list[Link] | None:
+        """None for more than a tree; coordinates: joint → coordinate; stated: native parameters."""
+        slides = {j.name for j in self.joints if j.type == "prismatic"}
+        waiting = [(joint, parent, child, tuple(map(float, rest))) for joint, parent, child, *rest in self.carried]
+        if len(waiting) != len(self.joints) or {child for _, _, child, _ in waiting} != set(self.masses):
+            return None
+        found: dict[str, Link] = {}
+        while waiting:
+            ready = [w for w in waiting if w[1] == "world" or w[1] in found]
+            if not ready or any(w[2] in found for w in ready):
+                return None
+            for joint, parent, child, n in ready:
+                found[child] = Link(
+                    child,
+                    None if parent == "world" else parent,
+                    (n[0], n[1], n[2]),
+                    (n[3], n[4], n[5], n[6]),
+                    coordinates.get(joint),
+                    joint,
+                    joint in slides,
+                    (n[7], n[8], n[9]),
+                    stated.get(f"mass.{child}", self.masses[child]),
+                    (n[10], n[11], n[12]),
+                    (n[13], n[14], n[15], n[16], n[17], n[18]),
+                    damping=stated.get(f"damping.{joint}"),
+                    dry=stated.get(f"coulomb_friction.{joint}"),
+                    stiffness=n[19],
+                    rest=n[20],
+                )
+                waiting.remove((joint, parent, child, n))
+        return list(found.values())
 
-def _joint(name: str, kind: str, damping: str, _friction: str, limited: str, _bounded: str, *ends: str) -> Joint:
+
+def _joint(name: str, kind: Any, damping: str, _friction: str, limited: str, _bounded: str, *ends: str) -> Joint:
     # What is as large as SDF's default is no end.
     low, high, speed, effort = (e if abs(e) < _NEVER else math.copysign(math.inf, e) for e in map(float, ends))
     # A negative limit means none.
     speed, effort = (math.inf if e < 0 else e for e in (speed, effort))
-    return Joint(
-        name,
-        _TYPES[kind],
-        float(damping),
-        limited == "1",
-        ends=(low, high),
-        speeds=(-speed, speed),
-        efforts=(-effort, effort),
-    )
+    return Joint(name, kind, float(damping), limited == "1", 0.0, (low, high), (-speed, speed), (-effort, effort))

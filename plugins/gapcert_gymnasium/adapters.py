@@ -19,11 +19,11 @@ OURS = "gymnasium.envs."
 @final
 @dataclass(frozen=True)
 class Known:
-    """A classic environment: `state` in order, the attribute that is its period, the unit of its action, native parameters
-    (attribute, unit, least value) and what follows from them; single: its state is single precision."""
+    """An environment: `state` and `action` in order, the attribute that is its period, native parameters (attribute, unit,
+    least value) and what follows from them; single: its state is single precision."""
 
     state: tuple[StateSpec, ...]
-    action: StateSpec
+    action: tuple[StateSpec, ...]
     period: str | None
     parameters: tuple[tuple[str, str, float], ...] = ()
     levels: Callable[[Any], Mapping[int, float]] | None = None
@@ -44,30 +44,30 @@ _CAR = (StateSpec("position", "1"), StateSpec("velocity", "1"))
 CLASSIC: dict[str, Known] = {
     "PendulumEnv": Known(
         (_angle("theta"), StateSpec("theta_dot", "rad/s")),
-        StateSpec("torque", "N*m"),
+        (StateSpec("torque", "N*m"),),
         "dt",
         (("g", "m/s^2", -math.inf), ("m", "kg", 1e-9), ("l", "m", 1e-9)),
     ),
     "CartPoleEnv": Known(
         (StateSpec("x", "m"), StateSpec("x_dot", "m/s"), _angle("theta"), StateSpec("theta_dot", "rad/s")),
-        StateSpec("force", "N"),
+        (StateSpec("force", "N"),),
         "tau",
         (("gravity", "m/s^2", -math.inf), ("masscart", "kg", 1e-9), ("masspole", "kg", 1e-9), ("length", "m", 1e-9)),
         levels=lambda env: {0: -float(env.force_mag), 1: float(env.force_mag)},
         follow=_cartpole,
         forget={"steps_beyond_terminated": None},
     ),
-    "Continuous_MountainCarEnv": Known(_CAR, StateSpec("force", "1"), None, (("power", "1", 0.0),), single=True),
+    "Continuous_MountainCarEnv": Known(_CAR, (StateSpec("force", "1"),), None, (("power", "1", 0.0),), single=True),
     "MountainCarEnv": Known(
         _CAR,
-        StateSpec("force", "1"),
+        (StateSpec("force", "1"),),
         None,
         (("force", "1", 0.0), ("gravity", "1", -math.inf)),
         levels=lambda env: {0: -1.0, 1: 0.0, 2: 1.0},
     ),
     "AcrobotEnv": Known(
         (_angle("theta1"), _angle("theta2"), StateSpec("theta1_dot", "rad/s"), StateSpec("theta2_dot", "rad/s")),
-        StateSpec("torque", "N*m"),
+        (StateSpec("torque", "N*m"),),
         "dt",
         (
             ("LINK_MASS_1", "kg", 1e-9),
@@ -128,7 +128,7 @@ class Attribute(Adapter):
             )
         self._type = np.asarray(own).dtype if self.single else np.dtype(np.float64)
         self.rest = (0.0,) * size
-        self.action = (known.action,)
+        self.action = known.action
         self.parameters = tuple(Parameter(n, float(getattr(env, n)), unit, low=low) for n, unit, low in known.parameters)
         self.period = None if known.period is None else float(getattr(env, known.period))
 
@@ -151,30 +151,15 @@ class Attribute(Adapter):
         return np.asarray(getattr(env, self.attribute), dtype=np.float64)
 
 
-@final
-class Own(Adapter):
+def own(env: Any, attribute: str, state: Sequence[StateSpec], action: Sequence[StateSpec], single: bool) -> Attribute:
     """An environment of the user's whose whole state is one attribute, and whose actions are a box or numbered."""
-
-    def __init__(self, env: Any, attribute: str, state: Sequence[StateSpec], action: Sequence[StateSpec], single: bool) -> None:
-        known = Known(tuple(state), action[0] if action else StateSpec("action"), None, single=single)
-        self._inner = Attribute(env, known, attribute)
-        self.state, self.rest, self.single = self._inner.state, self._inner.rest, single
-        space = env.action_space
-        numbered = type(space).__name__ == "Discrete"
-        size = 1 if numbered else int(np.prod(space.shape))
-        if len(action) != size:
-            raise UsageError(
-                f"backend.action: it names {len(action)} numbers; expected {size}, as the environment's {space} has"
-            )
-        self.action = tuple(action)
-        if numbered:
-            self.levels = {int(space.start) + k: float(int(space.start) + k) for k in range(int(space.n))}
-
-    def adjust(self, values: Mapping[str, float]) -> None:
-        """It has no parameters."""
-
-    def step(self, state: Array, action: Any) -> Array:
-        return self._inner.step(state, action)
+    found = Attribute(env, Known(tuple(state), tuple(action), None, single=single), attribute)
+    space = env.action_space
+    if len(action) != (size := int(np.prod(space.shape))):
+        raise UsageError(f"backend.action: it names {len(action)} numbers; expected {size}, as the environment's {space} has")
+    if type(space).__name__ == "Discrete":
+        found.levels = {k: float(k) for k in range(int(space.start), int(space.start + space.n))}
+    return found
 
 
 @final

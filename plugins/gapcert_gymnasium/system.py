@@ -18,7 +18,7 @@ from gapcert import Array, Backend, Context, StateSpec, System, UsageError
 from gapcert.plugin import Step, magnitude
 from gapcert_engines import check_ranges, muted
 
-from .adapters import CLASSIC, OURS, Adapter, Attribute, MuJoCo, Own
+from .adapters import CLASSIC, OURS, Adapter, Attribute, MuJoCo, own
 from .config import GymnasiumConfig, Levels
 
 _Option = Literal["hidden", "parameters"]
@@ -89,7 +89,7 @@ class GymnasiumBackend(Backend):
             raise UsageError("backend.state: it goes with action; give both for an environment of your own, or none")
         if config.state is not None and config.action is not None:
             state, action = ([StateSpec(n, c.unit, c.kind) for n, c in part.items()] for part in (config.state, config.action))
-            return Own(env, config.attribute, state, action, config.single)
+            return own(env, config.attribute, state, action, config.single)
         if self._class.startswith(OURS) and type(env).__name__ in CLASSIC:
             return Attribute(env, CLASSIC[type(env).__name__])
         if hasattr(env, "set_state") and hasattr(env, "model") and hasattr(env, "data"):
@@ -100,13 +100,12 @@ class GymnasiumBackend(Backend):
         )
 
     def _period(self, adapter: Adapter, model: System | None) -> float:
-        own = adapter.period
         if self.config.period is not None:
             period = magnitude(self.config.period, "s")
         elif model is not None:
             period = model.period
-        elif own is not None:
-            period = own
+        elif adapter.period is not None:
+            period = adapter.period
         else:
             raise UsageError(
                 "backend.period: there is neither a model nor an environment to take it from; add for instance period: 1 s"

@@ -11,7 +11,7 @@ import numpy as np
 from gapcert import Array
 from gapcert.plugin import Scene, Shape
 
-from .motors import floating
+from .robot import floating, scalar
 
 SEEN = 3
 """Geoms of groups below this are seen, as in MuJoCo's own viewer; the others collide."""
@@ -24,8 +24,7 @@ def scene(model: Any, position: Array, base: Array | None) -> Scene:
     """See Engine.scene; links are the bodies that have a shape."""
     shapes = _shapes(model)
     bodies = sorted({s.link for s in shapes})
-    scalar = (model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE) | (model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE)
-    data, places = mujoco.MjData(model), model.jnt_qposadr[scalar]
+    data, places = mujoco.MjData(model), model.jnt_qposadr[scalar(model)]
     poses = np.empty((len(position), len(bodies), 7))
     for k, row in enumerate(position):
         data.qpos[places] = row

@@ -14,15 +14,24 @@ import numpy as np
 
 from gapcert import Array, UsageError
 from gapcert.plugin import Scene
-from gapcert_engines import Drive, Engine, EngineWorld, Joint, as_backend
+from gapcert_engines import Drive, Engine, EngineWorld, Joint, Link, as_backend, moments
 
-from .actuators import motors
 from .config import MuJoCoConfig
 from .drawn import scene
-from .parameters import Natives, joint_name
+from .parameters import Natives
 from .patch import patched, wrapper
-from .robot import binary, compiled, left_over, restored, thrusters, unconstrained
-from .section import implicit, section
+from .robot import (
+    binary,
+    compiled,
+    joint_name,
+    left_over,
+    motors,
+    restored,
+    scalar,
+    thrusters,
+    touches,
+    unconstrained,
+)
 from .world import MuJoCoWorld
 from .xla import check, versions
 
@@ -31,6 +40,11 @@ _KINDS = {
     mujoco.mjtJoint.mjJNT_SLIDE: "prismatic",
     mujoco.mjtJoint.mjJNT_BALL: "ball",
     mujoco.mjtJoint.mjJNT_FREE: "free",
+}
+_INTEGRATORS = {
+    mujoco.mjtIntegrator.mjINT_EULER: "semi_implicit",
+    mujoco.mjtIntegrator.mjINT_IMPLICITFAST: "semi_implicit",
+    mujoco.mjtIntegrator.mjINT_RK4: "rk4",
 }
 _ITERATED = 1e-4  # relative: what MuJoCo's solver leaves at its default tolerance; chosen, not measured
 _COORDINATES_AT_MOST = 2048
@@ -62,7 +76,8 @@ class MuJoCoEngine(Engine):
         self.thrusters = () if config.drive else thrusters(model)
         natives = Natives(model)
         self.parameters = tuple(natives.parameters)
-        self._unconstrained, self._implicit = unconstrained(model), implicit(model)
+        self._unconstrained, self._implicit = unconstrained(model), _implicit(model)
+        self.integrator = _INTEGRATORS.get(model.opt.integrator, "")
         # Newton's too: it stops as the others do, also where a constraint has just begun or ceased to act.
         self.unsolved = 0.0 if self._unconstrained else left_over(model)
         self._belts = tuple(model.geom(int(k)).name for k in np.flatnonzero(model.geom_surfacevel.any(axis=1)))
@@ -74,7 +89,7 @@ class MuJoCoEngine(Engine):
             if binary(compiled(self._path, self.config)) != zlib.decompress(self._models[1]):
                 raise UsageError(f"backend.robot: {self.file} has changed since it was read; run again")
             self._models[copies] = zlib.compress(binary(compiled(self._path, self.config, copies)), 1)
-        one, many = (restored(zlib.decompress(self._models[k])) for k in (1, copies))
+        one, many = self._model(), self._model(copies)
         one.opt.timestep = many.opt.timestep = period / self.config.substeps
         return MuJoCoWorld(one, many, copies, self.config, drive)
 
@@ -85,14 +100,11 @@ class MuJoCoEngine(Engine):
         ]
         return [*data, self.config.tiles, *versions()] if self.rowwise else data
 
-    def section(
-        self, coordinates: Sequence[str], period: float, free: Mapping[str, str], values: Mapping[str, float]
-    ) -> dict[str, Any] | None:
-        model = restored(zlib.decompress(self._models[1]))
-        every = {p.name: p.value for p in self.parameters} | dict(values)
+    def links(self, coordinates: Mapping[str, str], period: float, values: Mapping[str, float]) -> list[Link] | None:
+        model, every = self._model(), self.stated | dict(values)
         model = Natives(model).varied(model, every)
         model.opt.timestep = period / self.config.substeps
-        return None if self.base or self.config.drive or self.thrusters else section(model, coordinates, free, every)
+        return _links(model, coordinates, every) if _plain(model) and not self.thrusters else None
 
     def accuracy(self, values: Mapping[str, float]) -> float:
         """Dry friction is solved until an iteration gains less than the option `tolerance`."""
@@ -102,13 +114,13 @@ class MuJoCoEngine(Engine):
         return self._implicit
 
     def patched(self, values: Mapping[str, float]) -> dict[str, str]:
-        gravity = restored(zlib.decompress(self._models[1])).opt.gravity.tolist()
+        gravity = self._model().opt.gravity.tolist()
         name = f"extended{self._path.suffix}"
         text, unsaid = patched(self._path.read_text(encoding="utf-8"), values, gravity)
         return {name: text} | ({"extended.py": wrapper(name, unsaid)} if unsaid else {})
 
     def scene(self, position: Array, base: Array | None) -> Scene:
-        return scene(restored(zlib.decompress(self._models[1])), position, base)
+        return scene(self._model(), position, base)
 
     def tiles(self) -> tuple[int, str]:
         if self.rowwise:
@@ -126,6 +138,9 @@ class MuJoCoEngine(Engine):
     def drivable(self) -> tuple[str, ...]:
         """The joints, and the geoms whose surface moves in the file: a target is a multiple of that velocity."""
         return (*super().drivable(), *(name for name in self._belts if name))
+
+    def _model(self, copies: int = 1) -> Any:
+        return restored(zlib.decompress(self._models[copies]))
 
     def _check(self, model: Any, kinds: list[str]) -> None:
         where = f"backend.robot: {self.file}"
@@ -155,3 +170,99 @@ def _joint(model: Any, k: int, kind: Any) -> Joint:
     # A constraint begins to act where the distance is below the margin.
     low, high, margin = float(model.jnt_range[k, 0]), float(model.jnt_range[k, 1]), float(model.jnt_margin[k])
     return replace(joint, limited=True, ends=(low + margin, high - margin)) if model.jnt_limited[k] else joint
+
+
+def _implicit(model: Any) -> bool:
+    """Is the damping D of joints solved with the step, (M + h D) a = forces − D v, as Euler and implicitfast do?"""
+    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+        return False
+    return not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP) or (
+        model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    )
+
+
+def _links(model: Any, coordinates: Mapping[str, str], values: Mapping[str, float]) -> list[Link]:
+    """The frame of a body is that of its last joint; joints before it move links without mass.
+
+    values: of all native parameters, which the model has.
+    """
+    found: list[Link] = []
+    carrier: list[tuple[str | None, Any]] = [(None, np.zeros(3))] * model.nbody
+    for k in range(1, model.nbody):
+        name = model.body(k).name or f"body{k}"
+        on, off = carrier[model.body_parentid[k]]
+        turned, place = model.body_quat[k].tolist(), model.body_pos[k] - off
+        first = int(model.body_jntadr[k])
+        joints = list(range(first, first + int(model.body_jntnum[k])))
+        anchor = np.zeros(3)
+        for i, j in enumerate(joints):
+            last = i == len(joints) - 1
+            anchor_before, anchor = anchor, model.jnt_pos[j].copy()
+            at = place + _rotated(turned, anchor) if i == 0 else anchor - anchor_before
+            moved = _moved(model, j, coordinates[joint_name(model, j)], name if last else f"{name}_before_{i + 1}", on, at)
+            found.append(moved if i else replace(moved, turn=tuple(turned)))
+            on = found[-1].name
+        if not joints:
+            found.append(Link(name, on, tuple(place.tolist()), tuple(turned)))
+        found[-1] = replace(found[-1], moment=values.get(f"inertia.{name}"), **_inertia(model, k, anchor))
+        carrier[k] = (name, anchor)
+    return found
+
+
+def _moved(model: Any, j: int, coordinate: str, name: str, on: str | None, at: Any) -> Link:
+    dof = model.jnt_dofadr[j]
+    return Link(
+        name,
+        on,
+        tuple(at.tolist()),
+        coordinate=coordinate,
+        joint=joint_name(model, j),
+        straight=bool(model.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE),
+        axis=tuple(model.jnt_axis[j].tolist()),
+        armature=float(model.dof_armature[dof]),
+        damping=float(model.dof_damping[dof]),
+        dry=float(model.dof_frictionloss[dof]),
+        soft=_softness(model, int(dof)),
+    )
+
+
+def _plain(model: Any) -> bool:
+    """Hinges and slides, without springs, contacts or anything else that acts; ends of joints act where they are reached."""
+    more = (model.jnt_stiffness, model.body_gravcomp, model.dof_dampingpoly)
+    acts = any(np.any(part) for part in more) or model.ntendon or model.neq or model.nflex
+    medium = model.opt.density or model.opt.viscosity or np.any(model.opt.wind)
+    return bool(scalar(model).all() and not acts and not medium and not touches(model) and model.opt.integrator in _INTEGRATORS)
+
+
+def _inertia(model: Any, k: int, anchor: Any) -> dict[str, Any]:
+    """Mass, centre and inertia of a body in its joint's frame."""
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, model.body_iquat[k])
+    full = turn.reshape(3, 3) @ np.diag(model.body_inertia[k]) @ turn.reshape(3, 3).T
+    return {
+        "mass": float(model.body_mass[k]),
+        "com": tuple((model.body_ipos[k] - anchor).tolist()),
+        "inertia": moments(full),
+        "origin": tuple((-anchor).tolist()),
+    }
+
+
+def _softness(model: Any, dof: int) -> tuple[float, float]:
+    """How dry friction gives way: R = (1 − d)/d · (M⁻¹)ᵢᵢ at qpos0 and b = 2/(d_max · timeconst), as mj_makeImpedance has it,
+    with d the impedance at rest.
+    """
+    low, high = (min(max(float(d), mujoco.mjMINIMP), mujoco.mjMAXIMP) for d in model.dof_solimp[dof][:2])
+    constant, ratio = map(float, model.dof_solref[dof])
+    if constant <= 0:
+        rate = -ratio / high
+    else:
+        if not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_REFSAFE):
+            constant = max(constant, 2 * float(model.opt.timestep))
+        rate = 2 / (high * constant)
+    return max(mujoco.mjMINVAL, (1 - low) / low * float(model.dof_invweight0[dof])), rate
+
+
+def _rotated(quaternion: Sequence[float], vector: Any) -> Any:
+    out = np.zeros(3)
+    mujoco.mju_rotVecQuat(out, vector, np.asarray(quaternion, dtype=np.float64))
+    return out

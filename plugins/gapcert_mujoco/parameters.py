@@ -10,14 +10,10 @@ import mujoco
 import numpy as np
 
 from gapcert import Parameter
-from gapcert_engines import Engine
+from gapcert_engines import Engine, Joint
 
-from .robot import touches
+from .robot import joint_name, scalar, touches
 
-UNITS = {
-    mujoco.mjtJoint.mjJNT_HINGE: {"damping": "N*m*s/rad", "frictionloss": "N*m", "armature": "kg*m^2"},
-    mujoco.mjtJoint.mjJNT_SLIDE: {"damping": "N*s/m", "frictionloss": "N", "armature": "kg"},
-}
 _FRICTION = {"friction": 1, "spinning_friction": 4, "rolling_friction": 6}
 """Factors on the friction of all contacts, in the order of MuJoCo's columns, and the least `condim` that has it."""
 _KEPT = 16
@@ -40,13 +36,12 @@ class Natives:
         self.parameters = list(Engine.gravity_parameters(one.opt.gravity.tolist()))
         self._places: list[tuple[str, str, Any]] = []
         again = np.arange(copies)
-        for k in range(one.njnt):
-            units = UNITS.get(mujoco.mjtJoint(one.jnt_type[k]), {})
-            dof = int(one.jnt_dofadr[k])
-            for what, unit in units.items():
-                value = float(getattr(one, f"dof_{what}")[dof])
-                parameter = Parameter(f"{what}.{joint_name(one, k)}", value, unit, low=0.0)
-                self._add(parameter, f"dof_{what}", dof + one.nv * again)
+        for k in np.flatnonzero(scalar(one)).tolist():
+            dof, slides = int(one.jnt_dofadr[k]), one.jnt_type[k] == mujoco.mjtJoint.mjJNT_SLIDE
+            joint = Joint(joint_name(one, k), "prismatic" if slides else "revolute")
+            for what in ("damping", "frictionloss", "armature"):
+                own = float(getattr(one, f"dof_{what}")[dof])
+                self._add(Engine.joint_parameter(what, joint, own), f"dof_{what}", dof + one.nv * again)
         for k in range(1, one.nbody):
             # A body that is welded to the world has no part in the motion.
             if one.body_mass[k] > 0 and one.body_weldid[k]:
@@ -130,8 +125,3 @@ class Natives:
         for k, name in enumerate(("contact_time", "contact_damping")):
             if name in values and values[name] != self._stated[name]:
                 model.geom_solref[:, k] = model.pair_solref[:, k] = values[name]
-
-
-def joint_name(model: Any, k: int) -> str:
-    """The file's, or joint0, joint1, …"""
-    return str(model.joint(k).name) or f"joint{k}"

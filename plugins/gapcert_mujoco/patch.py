@@ -4,16 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
 from gapcert import UsageError
-from gapcert_engines import RobotText, patched_urdf
+from gapcert_engines import RobotText, largest_moment, patched_urdf, setting_code
 
 _JOINT = {"damping": "damping", "frictionloss": "friction", "armature": None}
 """Of a joint, and what a URDF file calls it."""
 _PLACE, _INERTIA = {"com_x": 0, "com_y": 1, "com_z": 2}, ("diaginertia", "fullinertia")
 _FRICTION, _SPRING = {"friction": 0, "spinning_friction": 1, "rolling_friction": 2}, {"contact_time": 0, "contact_damping": 1}
 """Of contacts: columns of MuJoCo's arrays of geoms."""
+_GEAR = """at = [model.actuator(k).name or model.joint(model.actuator_trnid[k, 0]).name for k in range(model.nu)]
+model.actuator_gear[at.index("{element}"), 0] = {number}"""
+_SETTERS = {
+    **{name: f'model.dof_{name}[model.joint("{{element}}").dofadr] = {{number}}' for name in _JOINT},
+    **{name: f'model.body("{{element}}").ipos[{k}] = {{number}}' for name, k in _PLACE.items()},
+    "mass": 'body = model.body("{element}")\nbody.inertia *= {number} / body.mass\nbody.mass = {number}',
+    "inertia": 'body = model.body("{element}")\nbody.inertia *= {number} / body.inertia.max()',
+    "gear": _GEAR,
+    **{name: f"model.geom_friction[:, {k}] *= {{number}}" for name, k in _FRICTION.items()},
+    **{name: f"model.geom_solref[:, {k}] = {{number}}" for name, k in _SPRING.items()},
+    **{f"gravity_{a}": f"model.opt.gravity[{k}] = {{number}}" for k, a in enumerate("xyz")},
+}
 
 
 def patched(text: str, values: Mapping[str, float], gravity: Sequence[float]) -> tuple[str, dict[str, float]]:
@@ -37,33 +47,8 @@ def patched(text: str, values: Mapping[str, float], gravity: Sequence[float]) ->
 
 def wrapper(file: str, values: Mapping[str, float]) -> str:
     """Code that loads the file and sets what it cannot say."""
-    lines = ["import mujoco", "", f'model = mujoco.MjModel.from_xml_path("{file}")']
-    for name, value in values.items():
-        what, _, element = name.partition(".")
-        number = repr(float(value))
-        if what in _JOINT:
-            lines.append(f'model.dof_{what}[model.joint("{element}").dofadr] = {number}')
-        elif what == "mass":
-            lines.append(f'body = model.body("{element}")')
-            lines.append(f"body.inertia *= {number} / body.mass")
-            lines.append(f"body.mass = {number}")
-        elif what == "inertia":
-            lines.append(f'body = model.body("{element}")')
-            lines.append(f"body.inertia *= {number} / body.inertia.max()")
-        elif what in _PLACE:
-            lines.append(f'model.body("{element}").ipos[{_PLACE[what]}] = {number}')
-        elif what == "gear":
-            lines.append(
-                "at = [model.actuator(k).name or model.joint(model.actuator_trnid[k, 0]).name for k in range(model.nu)]"
-            )
-            lines.append(f'model.actuator_gear[at.index("{element}"), 0] = {number}')
-        elif what in _FRICTION:
-            lines.append(f"model.geom_friction[:, {_FRICTION[what]}] *= {number}")
-        elif what in _SPRING:
-            lines.append(f"model.geom_solref[:, {_SPRING[what]}] = {number}")
-        else:
-            lines.append(f"model.opt.gravity[{'xyz'.index(what[-1])}] = {number}")
-    return "\n".join([*lines, "mujoco.mj_setConst(model, mujoco.MjData(model))", ""])
+    load = f'import mujoco\n\nmodel = mujoco.MjModel.from_xml_path("{file}")'
+    return "\n".join([load, *setting_code(_SETTERS, values), "mujoco.mj_setConst(model, mujoco.MjData(model))", ""])
 
 
 def _with(file: RobotText, name: str, value: float) -> RobotText:
@@ -96,16 +81,10 @@ def _body(file: RobotText, body: str, what: str, value: float) -> RobotText:
                 place[_PLACE[what]] = repr(float(value))
                 return file.put(below, pos=" ".join(place))
             inertia = {k: list(map(float, v.split())) for k, v in below.attributes.items() if k in _INERTIA}
-            stated = float(below.attributes["mass"]) if what == "mass" else max(map(_largest, inertia.values()))
+            stated = float(below.attributes["mass"]) if what == "mass" else max(largest_moment(*n) for n in inertia.values())
             scaled = {k: " ".join(repr(n * value / stated) for n in v) for k, v in inertia.items()}
             return file.put(below, **scaled, **({"mass": repr(float(value))} if what == "mass" else {}))
     raise UsageError(f"{what}.{body}: it follows from the geometry; give the body an inertial element, or set it in code")
-
-
-def _largest(numbers: Sequence[float]) -> float:
-    """The largest principal moment of three, or of xx, yy, zz, xy, xz, yz."""
-    xx, yy, zz, xy, xz, yz = (*numbers, 0.0, 0.0, 0.0)[:6]
-    return float(np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])[-1])
 
 
 def _option(file: RobotText, **values: str) -> RobotText:

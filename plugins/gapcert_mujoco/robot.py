@@ -1,21 +1,24 @@
-"""A robot file as a compiled MuJoCo model: what the spec's options change, and several copies in one model."""
+"""A robot file as a compiled MuJoCo model: what the spec's options change, several copies in one model, and its motors."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
+import numpy.typing as npt
 
 from gapcert import UsageError
-from gapcert_engines import Thruster
+from gapcert_engines import Motor, Thruster
 
 if TYPE_CHECKING:
     from .config import MuJoCoConfig
 
 _SCALAR = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _PLAIN = (mujoco.mjtTrn.mjTRN_SITE, mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE)
 _DISABLE = mujoco.mjtDisableBit
 _ALL = 2**31 - 1
@@ -63,10 +66,7 @@ def _spec(path: Path, config: MuJoCoConfig) -> Any:
     those at sites that inputs name."""
     spec = mujoco.MjSpec.from_file(str(path))
     controls = {target for target in config.inputs.values() if target.endswith(".ctrl")}
-    left_out = [a for a in spec.actuators if not (f"{a.name}.ctrl" in controls and _at_site(a))]
-    for elements in (spec.keys, spec.tuples, spec.sensors, left_out, spec.cameras, spec.lights):
-        for element in list(elements):
-            spec.delete(element)
+    _strip(spec, [a for a in spec.actuators if not (f"{a.name}.ctrl" in controls and _at_site(a))])
     _set_base(spec, path, config.fixed_base)
     _set_options(spec, config)
     for joint in spec.joints:
@@ -77,6 +77,13 @@ def _spec(path: Path, config: MuJoCoConfig) -> Any:
     if config.drive is not None:
         _add_motors(spec, config)
     return spec
+
+
+def _strip(spec: Any, actuators: Sequence[Any] = ()) -> None:
+    """Takes out what moves nothing, and these actuators."""
+    for elements in (spec.keys, spec.tuples, spec.sensors, actuators, spec.cameras, spec.lights):
+        for element in list(elements):
+            spec.delete(element)
 
 
 def _at_site(actuator: Any) -> bool:
@@ -90,6 +97,46 @@ def thrusters(model: Any) -> tuple[Thruster, ...]:
     """Of a compiled robot without a drive: motors at sites. Controls are in N where they push, else in N·m."""
     pushes = model.actuator_gear[:, :3].any(axis=1)
     return tuple(Thruster(str(model.actuator(k).name), "N" if pushes[k] else "N*m") for k in range(model.nu))
+
+
+def motors(path: Path) -> tuple[Motor, ...]:
+    """Of the file: those that are alone at a hinge or slide, with a gear; one without a name has its joint's."""
+    spec = mujoco.MjSpec.from_file(str(path))
+    if not list(spec.actuators):
+        return ()
+    _strip(spec)
+    try:
+        model = spec.compile()
+    except ValueError:  # What is wrong with the robot is told where it is compiled without them.
+        return ()
+    kinds = [mujoco.mjtTrn(int(kind)) for kind in model.actuator_trntype]
+    at = [int(j) if kind in _JOINTS else -1 for j, kind in zip(model.actuator_trnid[:, 0], kinds, strict=True)]
+    found = [_motor(model, k, j) for k, j in enumerate(at) if j >= 0 and at.count(j) == 1 and _lawless(model, k, j)]
+    names = [m.name for m in found]
+    return tuple(m for m in found if names.count(m.name) == 1)
+
+
+def _lawless(model: Any, k: int, joint: int) -> bool:
+    """Is its effort gear · control, without a law or a memory of its own?"""
+    law = [int(part[k]) for part in (model.actuator_dyntype, model.actuator_gaintype, model.actuator_biastype)]
+    plain = law == list(map(int, _PLAIN[1:])) and mujoco.mjtJoint(int(model.jnt_type[joint])) in _SCALAR
+    more = (model.actuator_delay, model.actuator_armature, model.actuator_damping, model.actuator_dampingpoly)
+    single = model.actuator_gainprm[k, 0] == 1 and model.actuator_gear[k, 0] != 0
+    return bool(plain and single and not any(np.any(part[k]) for part in more))
+
+
+def _motor(model: Any, k: int, joint: int) -> Motor:
+    gear, low, high = float(model.actuator_gear[k, 0]), -np.inf, np.inf
+    parts = (
+        (model.actuator_ctrllimited[k], model.actuator_ctrlrange[k]),
+        (model.actuator_forcelimited[k], model.actuator_forcerange[k]),
+        (model.jnt_actfrclimited[joint], np.sort(model.jnt_actfrcrange[joint] / gear)),
+    )
+    for limited, ends in parts:
+        if limited:
+            low, high = max(low, float(ends[0])), min(high, float(ends[1]))
+    name = joint_name(model, joint)
+    return Motor(str(model.actuator(k).name) or name, name, gear, (low, high))
 
 
 def _set_base(spec: Any, path: Path, fixed: bool) -> None:
@@ -195,6 +242,22 @@ def binary(model: Any) -> bytes:
 def restored(data: bytes) -> Any:
     """Inverse of `binary`."""
     return mujoco.MjModel.from_binary_path("robot.mjb", {"robot.mjb": data})
+
+
+def joint_name(model: Any, k: int) -> str:
+    """The file's, or joint0, joint1, …"""
+    return str(model.joint(k).name) or f"joint{k}"
+
+
+def scalar(model: Any) -> npt.NDArray[np.bool_]:
+    """Which joints are hinges and slides, of one number each."""
+    return np.isin(model.jnt_type, _SCALAR)
+
+
+def floating(model: Any) -> tuple[int, int]:
+    """Where the free joint's positions and velocities start."""
+    free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+    return (int(model.jnt_qposadr[free[0]]), int(model.jnt_dofadr[free[0]])) if len(free) else (0, 0)
 
 
 def unconstrained(model: Any) -> bool:

@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NoReturn, final
 
-import mujoco
 import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array, UsageError
 from gapcert_engines import Drive, EngineWorld
 
-from .motors import Motors, floating, turned
 from .parameters import Natives
-from .robot import idle, unconstrained
-from .stepping import Broken, Rollouts, Rows, unheard
+from .robot import floating, idle, scalar, unconstrained
+from .stepping import Broken, Motors, Rollouts, Rows, turned, unheard
 from .xla import Compiled
 
 if TYPE_CHECKING:
@@ -33,9 +31,9 @@ class MuJoCoWorld(EngineWorld):
         self._natives = Natives(one, copies)
         self._motors = Motors(drive, many) if drive is not None else None
         self._unconstrained = unconstrained(one)
-        scalar = (many.jnt_type == mujoco.mjtJoint.mjJNT_HINGE) | (many.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE)
-        self._position, self._velocity = many.jnt_qposadr[scalar], many.jnt_dofadr[scalar]
-        self._floats, self._floating = not scalar.all(), floating(many)
+        single = scalar(many)
+        self._position, self._velocity = many.jnt_qposadr[single], many.jnt_dofadr[single]
+        self._floats, self._floating = not single.all(), floating(many)
         self._values: dict[str, float] = {}
         self._stepper: Rollouts | Rows | Compiled | None = None
         self._alone: MuJoCoWorld | None = None

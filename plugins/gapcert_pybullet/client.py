@@ -6,7 +6,7 @@ import contextlib
 import os
 import tempfile
 import weakref
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, final
 
@@ -15,20 +15,16 @@ import numpy as np
 from gapcert import Array, Parameter, UsageError
 from gapcert_engines import BodyInertia, Drive, Joint, muted
 
-from .rotation import inverse, product, rotated
-
 if TYPE_CHECKING:
     from .config import PyBulletConfig
     from .urdf import RobotFile
 
 
 with muted():
-    import pybullet
+    import pybullet as pybullet
 
 JOINTS_AT_MOST = 120
 """Bullet's state arrays hold 128 numbers, seven of them for the base; beyond, it answers wrongly without a word."""
-
-__all__ = ["JOINTS_AT_MOST", "Client", "pybullet"]
 
 _STRONG = 1e9  # N or N·m: no limit
 _CONTACT = {"rolling_friction": "rollingFriction", "spinning_friction": "spinningFriction", "restitution": "restitution"}
@@ -40,6 +36,8 @@ _TYPES = {
     pybullet.JOINT_PLANAR: "planar",
     pybullet.JOINT_FIXED: "fixed",
 }
+Vector = tuple[float, float, float]
+Turn = tuple[float, float, float, float]
 
 
 @final
@@ -233,8 +231,7 @@ class Client:
         forces = effort.copy()
         if drive.gain is not None:
             rates = np.array([s[1] for s in pybullet.getJointStates(body, index, number)])
-            push = drive.gain * (targets - rates)
-            forces[wheels] += push if drive.limit is None else np.clip(push, -drive.limit, drive.limit)
+            forces[wheels] += drive.effort(targets, rates)
         pybullet.setJointMotorControlArray(
             body, self.index, pybullet.TORQUE_CONTROL, forces=forces.tolist(), physicsClientId=number
         )
@@ -289,3 +286,30 @@ def _disconnect(client: int) -> None:
     # An engine that is gone already (at exit, or closed by hand) is what is wanted.
     with contextlib.suppress(pybullet.error):
         pybullet.disconnect(client)
+
+
+# Unit quaternions (x, y, z, w) as Bullet writes them; its own helpers of Python compute in single precision
+
+
+def inverse(turn: Sequence[float]) -> Turn:
+    """The turn back."""
+    x, y, z, w = turn
+    return -x, -y, -z, w
+
+
+def product(a: Sequence[float], b: Sequence[float]) -> Turn:
+    """First b, then a."""
+    (x, y, z, w), (p, q, r, s) = a, b
+    return (
+        w * p + x * s + y * r - z * q,
+        w * q - x * r + y * s + z * p,
+        w * r + x * q - y * p + z * s,
+        w * s - x * p - y * q - z * r,
+    )
+
+
+def rotated(turn: Sequence[float], v: Sequence[float]) -> Vector:
+    """v turned: v + 2 w (n × v) + 2 n × (n × v) with n = (x, y, z)."""
+    x, y, z, w = turn
+    a, b, c = 2 * (y * v[2] - z * v[1]), 2 * (z * v[0] - x * v[2]), 2 * (x * v[1] - y * v[0])
+    return v[0] + w * a + y * c - z * b, v[1] + w * b + z * a - x * c, v[2] + w * c + x * b - y * a

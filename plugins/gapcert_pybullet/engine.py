@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import math
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -11,14 +12,14 @@ from typing import Any, final
 
 from gapcert import Array, Parameter, UsageError
 from gapcert.plugin import Scene
-from gapcert_engines import Drive, Engine, as_backend, file_shapes
+from gapcert_engines import Drive, Engine, Link, as_backend, file_shapes, patched_file, setting_code
 
-from .client import JOINTS_AT_MOST, Client
+from .client import JOINTS_AT_MOST, Client, inverse, product, pybullet, rotated
 from .config import PyBulletConfig
-from .patch import files
-from .section import section
 from .urdf import RobotFile
 from .world import PyBulletWorld
+
+_UNIT = 1e-10  # between an axis that was written in decimals and a unit vector; chosen, not measured
 
 
 @final
@@ -61,11 +62,31 @@ class PyBulletEngine(Engine):
     def section(
         self, coordinates: Sequence[str], period: float, free: Mapping[str, str], values: Mapping[str, float]
     ) -> dict[str, Any] | None:
-        if self.base or self.config.drive or self.config.touches:
+        """See Engine.section; with Bullet's drag.
+
+        Bullet takes damping from the velocity at the beginning of a step. Its drag holds every link back by m v k (1 + |v|) at
+        its centre of mass, and by I ω l (1 + |ω|), with k its linear and l its angular damping (btMultiBody).
+        """
+        out, drag = super().section(coordinates, period, free, values), {}
+        if out is None:
+            return None
+        for what, square in (("linear", "second/metre"), ("angular", "second")):
+            name, number = free.get(f"{what}_damping"), self.stated[f"{what}_damping"]
+            if name is not None:
+                out["parameters"] |= {"metre": "1 m", "second": "1 s"}
+                drag[what] = [name, f"{name}*{square}"]
+            elif number:
+                drag[what] = [repr(number)] * 2
+        for body in out["bodies"].values() if drag else ():
+            body["drag"] = drag
+        return out
+
+    def links(self, coordinates: Mapping[str, str], period: float, values: Mapping[str, float]) -> list[Link] | None:
+        if self.config.touches:
             return None
         client = Client(self.robot, self.config, 1)
         try:
-            return section(client, coordinates, {p.name: p.value for p in self.parameters}, free)
+            return _links(client, coordinates, self.stated)
         finally:
             client.close()
 
@@ -76,7 +97,28 @@ class PyBulletEngine(Engine):
         return 1e-2 if swept else super().accuracy(values)
 
     def patched(self, values: Mapping[str, float]) -> dict[str, str]:
-        return files(self.robot.content.decode(), self.config, values, {p.name: p.value for p in self.parameters})
+        # Bullet passes over the friction of a file's joints.
+        words, given = {"damping": "damping"}, {"damping": self.config.joint_damping}
+        patched, unsaid = patched_file(self.robot.content.decode(), values, self.stated, words, given)
+        return patched | ({"extended.py": self._code(unsaid, self.stated | dict(values))} if unsaid else {})
+
+    def _code(self, unsaid: Mapping[str, float], values: Mapping[str, float]) -> str:
+        """Code that loads the file as a client of this package does, and sets what the file cannot say."""
+        config = self.config
+        code = _LOADED.format(
+            fixed=config.fixed_base,
+            flags=", flags=pybullet.URDF_USE_INERTIA_FROM_FILE" if config.use_inertia_from_file else "",
+            gravity=", ".join(repr(float(values[f"gravity_{a}"])) for a in "xyz"),
+            drag=", ".join(f"{w}Damping={float(values[f'{w}_damping'])!r}" for w in ("linear", "angular")),
+        )
+        if any(name.startswith("coulomb_friction.") for name in unsaid):
+            code += _STRENGTH
+        setters = _SETTERS
+        if time := float(unsaid.get("contact_time", 0.0)):
+            mass = sum(v for n, v in self.stated.items() if n.startswith("mass."))
+            spring = f"contactStiffness={mass / time**2!r}, contactDamping={2 * mass / time!r}"
+            setters = _SETTERS | {"contact_time": _EVERY % spring}
+        return "\n".join([code, *setting_code(setters, unsaid), ""])
 
     def scene(self, position: Array, base: Array | None) -> Scene:
         client = Client(self.robot, self.config, 1)
@@ -120,3 +162,81 @@ class PyBulletEngine(Engine):
             *(p for b in bodies for p in b.parameters(lightest=None)),
             *((Parameter("friction", friction, low=0.0), *client.contact()) if config.touches else ()),
         )
+
+
+def _links(client: Client, coordinates: Mapping[str, str], stated: Mapping[str, float]) -> list[Link]:
+    """Bullet has the frame of a link in its centre of mass, along the axes of its inertia, and says there where joints are."""
+    found: list[Link] = []
+    body, number = client.body, client.id
+    base = pybullet.getBasePositionAndOrientation(body, number)
+    for at, joint in enumerate(client.joints):
+        info, dynamics = pybullet.getJointInfo(body, at, number), pybullet.getDynamicsInfo(body, at, number)
+        mass, inertia, centre, axes = dynamics[0], dynamics[2], dynamics[3], dynamics[4]
+        parent = None if info[16] < 0 else found[info[16]]
+        # What Bullet calls the joint's rotation turns the parent's vectors into the link's.
+        place, turn = info[14], inverse(info[15])
+        if parent is None:
+            place, turn = rotated(base[1], place), product(base[1], turn)
+        x, y, z = (a + b for a, b in zip(place, base[0] if parent is None else parent.com, strict=True))
+        i, j, k, w = turn
+        link = Link(
+            info[12].decode(),
+            None if parent is None else parent.name,
+            (x, y, z),
+            (w, i, j, k),
+            mass=mass,
+            com=rotated(inverse(axes), centre),
+            inertia=(*inertia, 0.0, 0.0, 0.0),
+            moment=max(inertia),
+        )
+        if joint.movable:
+            if abs(1 - (length := math.hypot(*info[13]))) > _UNIT:
+                raise UsageError(
+                    f"robot: the axis of joint '{joint.name}' is {length:.9g} long, and Bullet moves it by that much faster; "
+                    f"expected a unit vector; write it with all its digits"
+                )
+            name, slides = joint.name, joint.type == "prismatic"
+            link = replace(
+                link,
+                coordinate=coordinates[name],
+                joint=name,
+                straight=slides,
+                axis=info[13],
+                damping=stated[f"damping.{name}"],
+                dry=stated[f"coulomb_friction.{name}"],
+            )
+        found.append(link)
+    return found
+
+
+_LOADED = """import pybullet
+
+pybullet.connect(pybullet.DIRECT)
+robot = pybullet.loadURDF("extended.urdf", useFixedBase={fixed}{flags})
+pybullet.setGravity({gravity})
+pybullet.changeDynamics(robot, -1, {drag})
+names = [pybullet.getJointInfo(robot, k) for k in range(pybullet.getNumJoints(robot))]
+joints, links = ({{info[i].decode(): info[0] for info in names}} for i in (1, 12))
+for joint in joints.values():
+    pybullet.setJointMotorControl2(robot, joint, pybullet.VELOCITY_CONTROL, force=0)"""
+_STRENGTH = """
+# Bullet turns a motor's strength into an impulse now, with the time step that is set: setTimeStep comes before."""
+_EVERY = """for link in (-1, *links.values()):
+    pybullet.changeDynamics(robot, link, %s)"""
+_MASS = """link = links.get("{element}", -1)
+mass, _, inertia, *_ = pybullet.getDynamicsInfo(robot, link)
+pybullet.changeDynamics(robot, link, mass={number}, localInertiaDiagonal=[i * {number} / mass for i in inertia])"""
+_INERTIA = """link = links.get("{element}", -1)
+inertia = [i * {number} for i in pybullet.getDynamicsInfo(robot, link)[2]]
+pybullet.changeDynamics(robot, link, localInertiaDiagonal=inertia)"""
+_SETTERS = {
+    "damping": 'pybullet.changeDynamics(robot, joints["{element}"], jointDamping={number})',
+    "coulomb_friction": 'pybullet.setJointMotorControl2(robot, joints["{element}"], pybullet.VELOCITY_CONTROL, '
+    "targetVelocity=0, force={number})",
+    "mass": _MASS,
+    "inertia": _INERTIA,
+    "friction": _EVERY % "lateralFriction={number}",
+    "rolling_friction": _EVERY % "rollingFriction={number}",
+    "spinning_friction": _EVERY % "spinningFriction={number}",
+    "restitution": _EVERY % "restitution={number}",
+}

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import final
 
 from gapcert import UsageError
+from gapcert_engines import read_robot
 
 KINDS = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar", "spherical")
 
@@ -22,15 +23,7 @@ class RobotFile:
 
     def __init__(self, path: Path, *, limits: bool = True) -> None:
         self.path, self.limits = path, limits
-        if not path.is_file():
-            raise UsageError(f"robot: there is no file {path}; give the path of a URDF file, relative to the spec")
-        self.content = path.read_bytes()
-        try:
-            root = ET.fromstring(self.content)
-        except ET.ParseError as error:
-            raise UsageError(f"robot: {path} is no XML: {error}; expected a URDF file") from None
-        if root.tag != "robot":
-            raise UsageError(f"robot: {path} starts with <{root.tag}>; expected a URDF file, which starts with <robot>")
+        self.content, root = read_robot(path, ["robot"], "a URDF file", "a URDF file, which starts with <robot>")
         _check_joints(root, path)
         children = {c.get("link") for c in root.findall("joint/child")}
         self.roots = [name for link in root.findall("link") if (name := link.get("name")) not in children]

@@ -7,7 +7,6 @@ import pytest
 from gapcert import UsageError
 from gapcert_gazebo.engine import _nanoseconds
 from gapcert_gazebo.sdf import Description, world_text
-from gapcert_gazebo.section import links
 
 INF = 1e16  # SDF's default
 FACTS = [
@@ -50,7 +49,7 @@ def test_the_world_around_the_robot_is_as_it_says(arm):
 
 
 def test_links_hang_from_each_other_with_the_numbers_of_the_file(arm):
-    upper, lower = links(arm, {"shoulder": "q1", "elbow": "q2"}, {"mass.lower": 4.0, "damping.elbow": 0.9})
+    upper, lower = arm.links({"shoulder": "q1", "elbow": "q2"}, {"mass.lower": 4.0, "damping.elbow": 0.9})
     assert (upper.parent, lower.parent, upper.mass, lower.mass) == (None, "upper", 2.0, 4.0)
     assert (upper.straight, lower.straight, lower.damping, lower.stiffness, lower.rest) == (False, True, 0.9, 7.0, 0.3)
 

@@ -6,7 +6,7 @@ import copy
 import hashlib
 import xml.etree.ElementTree as ET
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import ClassVar
 
@@ -28,14 +28,7 @@ class RobotDescription(ABC):
 
     def __init__(self, path: Path, *, model: str | None = None, shapes: bool = False) -> None:
         self.path, self.shapes = path, shapes
-        if not path.is_file():
-            raise UsageError(f"robot: there is no file {path}; give the path of {self.expected}, relative to the spec")
-        try:
-            root = ET.fromstring(path.read_bytes())
-        except ET.ParseError as error:
-            raise UsageError(f"robot: {path} is no XML: {error}; expected {self.expected}") from None
-        if root.tag not in self.kinds:
-            raise UsageError(f"robot: {path} starts with <{root.tag}>; expected {self.tags}")
+        _, root = read_robot(path, self.kinds, self.expected, self.tags)
         self.kind = self.kinds[root.tag]
         if model is not None and self.kind != "sdf":
             raise UsageError(f"backend.model: {path} {self.single}; leave out model: {model}")
@@ -99,6 +92,20 @@ class RobotDescription(ABC):
 
     def _named(self, path: Path) -> str:
         return path.as_uri()
+
+
+def read_robot(path: Path, roots: Collection[str], expected: str, tags: str) -> tuple[bytes, ET.Element]:
+    """The content of a file and its root, which is one of `roots`; UsageError, with what is `expected` in words, else."""
+    if not path.is_file():
+        raise UsageError(f"robot: there is no file {path}; give the path of {expected}, relative to the spec")
+    content = path.read_bytes()
+    try:
+        root = ET.fromstring(content)
+    except ET.ParseError as error:
+        raise UsageError(f"robot: {path} is no XML: {error}; expected {expected}") from None
+    if root.tag not in roots:
+        raise UsageError(f"robot: {path} starts with <{root.tag}>; expected {tags}")
+    return content, root
 
 
 def chosen_model(root: ET.Element, name: str | None, path: Path) -> ET.Element:

@@ -6,9 +6,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
-from gapcert_engines.contract import NATIVE, NATIVE_UNITS
+import numpy as np
+
+from gapcert.plugin import Array
+
+NATIVE = {"viscous-friction": ("damping",), "coulomb-friction": ("frictionloss", "coulomb_friction")}
+"""What engines call the parameters that realise effects at a joint, `KIND.JOINT`."""
+NATIVE_UNITS = {
+    False: {"damping": "N*m*s/rad", "dry": "N*m", "armature": "kg*m^2", "stiffness": "N*m/rad", "rest": "rad"},
+    True: {"damping": "N*s/m", "dry": "N", "armature": "kg", "stiffness": "N/m", "rest": "m"},
+}
+"""Of what joints have, by whether they slide."""
 
 Vector = tuple[float, float, float]
+Moments = tuple[float, float, float, float, float, float]
+"""An inertia as xx, yy, zz, xy, xz, yz."""
 
 
 @final
@@ -35,7 +47,7 @@ class Link:
     axis: Vector = (0.0, 0.0, 1.0)
     mass: float = 0.0
     com: Vector = (0.0, 0.0, 0.0)
-    inertia: tuple[float, float, float, float, float, float] = (0.0,) * 6
+    inertia: Moments = (0.0,) * 6
     armature: float | None = None
     damping: float | None = None
     dry: float | None = None
@@ -44,6 +56,17 @@ class Link:
     rest: float = 0.0
     origin: Vector = (0.0, 0.0, 0.0)
     moment: float | None = None
+
+
+def moments(inertia: Array) -> Moments:
+    """Of an inertia (3, 3)."""
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = inertia.tolist()
+    return xx, yy, zz, xy, xz, yz
+
+
+def largest_moment(xx: float, yy: float, zz: float, xy: float = 0.0, xz: float = 0.0, yz: float = 0.0) -> float:
+    """The largest principal one."""
+    return float(np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])[-1])
 
 
 def as_section(

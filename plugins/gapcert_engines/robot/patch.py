@@ -1,18 +1,108 @@
-"""Native parameters written into URDF and SDF files."""
+"""Numbers written into robot files, native parameters into URDF and SDF: nothing else changes, comments and layout included."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
-
-import numpy as np
+from dataclasses import dataclass
+from functools import cached_property
+from typing import final
 
 from gapcert.plugin import UsageError
 
-from .xml_patch import RobotText, Tag
+from .links import largest_moment
 
+_TAG = re.compile(r"<!--.*?-->|<\?.*?\?>|<!\[CDATA\[.*?\]\]>|<(/?)([\w:.-]+)((?:[^<>\"']|\"[^\"]*\"|'[^']*')*?)(/?)>", re.S)
+_ATTRIBUTE = re.compile(r"([\w:.-]+)\s*=\s*(\"[^\"]*\"|'[^']*')")
 _PLACE = ("com_x", "com_y", "com_z")
 _MOMENTS = {"ixx": 1.0, "iyy": 1.0, "izz": 1.0, "ixy": 0.0, "ixz": 0.0, "iyz": 0.0}
 """Of an inertia in SDF, with what it is where a file does not say it."""
+
+
+@final
+@dataclass(frozen=True)
+class Tag:
+    """A start tag in a text: where it begins and ends, what it is, and its attributes."""
+
+    begin: int
+    end: int
+    kind: str
+    attributes: dict[str, str]
+    depth: int
+
+
+@final
+@dataclass(frozen=True)
+class RobotText:
+    """The text of an MJCF, URDF or SDF file. What changes gives a new one; the rest of the text stays as it is."""
+
+    text: str
+
+    @cached_property
+    def tags(self) -> tuple[Tag, ...]:
+        """Every start tag, in order; what stands in comments is none."""
+        out, depth = [], 0
+        for m in _TAG.finditer(self.text):
+            if m[2] is None:
+                continue
+            if m[1]:
+                depth -= 1
+                continue
+            found = {n: v[1:-1] for n, v in _ATTRIBUTE.findall(m[3])}
+            out.append(Tag(m.start(), m.end(), m[2], found, depth))
+            depth += not m[4]
+        return tuple(out)
+
+    def inside(self, tag: Tag) -> list[Tag]:
+        """The tags directly below one."""
+        below = []
+        for t in self.tags[self.tags.index(tag) + 1 :]:
+            if t.depth <= tag.depth:
+                break
+            if t.depth == tag.depth + 1:
+                below.append(t)
+        return below
+
+    def named(self, kind: str, name: str, inside: Tag | None = None) -> Tag:
+        """The tag of a kind with a name, anywhere or directly below one; UsageError where the file has none."""
+        for tag in self.tags if inside is None else self.inside(inside):
+            if tag.kind == kind and tag.attributes.get("name") == name:
+                return tag
+        raise UsageError(f'the robot file has no <{kind} name="{name}">; it may be in a file that it includes')
+
+    def put(self, tag: Tag, **values: str) -> RobotText:
+        """With attributes of one tag set."""
+        own = self.text[tag.begin : tag.end]
+        for name, value in values.items():
+            known = re.search(rf"(?<![\w:.-]){re.escape(name)}(\s*=\s*)(\"[^\"]*\"|'[^']*')", own)
+            if known:
+                own = own[: known.start(2)] + f'"{value}"' + own[known.end(2) :]
+                continue
+            end = re.search(r"\s*/?>$", own)
+            assert end is not None, "a start tag ends with >"
+            own = own[: end.start()] + f' {name}="{value}"' + own[end.start() :]
+        return RobotText(self.text[: tag.begin] + own + self.text[tag.end :])
+
+    def fill(self, tag: Tag, content: str) -> RobotText:
+        """With the text of an element that has no other inside."""
+        own, after = self.text[tag.begin : tag.end], self.text[tag.end :]
+        if own.endswith("/>"):
+            return RobotText(self.text[: tag.begin] + f"{own[:-2].rstrip()}>{content}</{tag.kind}>" + after)
+        return RobotText(self.text[: tag.end] + content + after[after.index(f"</{tag.kind}") :])
+
+    def content(self, tag: Tag) -> str:
+        """The text of an element that has no other inside."""
+        after = self.text[tag.end :]
+        return "" if self.text[: tag.end].endswith("/>") else after[: after.index(f"</{tag.kind}")].strip()
+
+    def insert(self, tag: Tag, element: str) -> RobotText:
+        """With an element as the first of those inside one, indented as it would be by hand."""
+        line = self.text[self.text.rfind("\n", 0, tag.begin) + 1 : tag.begin]
+        indent, own, after = "" if line.strip() else line, self.text[tag.begin : tag.end], self.text[tag.end :]
+        if own.endswith("/>"):
+            own = own[:-2].rstrip() + ">"
+            after = f"\n{indent}</{tag.kind}>" + after
+        return RobotText(self.text[: tag.begin] + own + f"\n{indent}  {element}" + after)
 
 
 def patched_file(
@@ -37,6 +127,15 @@ def patched_file(
         down = [stated[f"gravity_{a}"] for a in "xyz"]
         name, (text, unsaid) = "extended.sdf", patched_sdf(text, values, down, model)
     return {name: text}, {n: v / stated[n] if n.startswith("inertia.") else v for n, v in unsaid.items()}
+
+
+def setting_code(templates: Mapping[str, str], values: Mapping[str, float]) -> list[str]:
+    """Lines of code that set native parameters `KIND.ELEMENT`: the template of each KIND with its {element} and {number}."""
+    lines = list[str]()
+    for name, value in values.items():
+        what, _, element = name.partition(".")
+        lines += templates.get(what, "").format(element=element, number=repr(float(value))).splitlines()
+    return lines
 
 
 def patched_urdf(text: str, values: Mapping[str, float], words: Mapping[str, str]) -> tuple[str, dict[str, float]]:
@@ -106,10 +205,12 @@ def _urdf_mass(file: RobotText, link: str, what: str, value: float) -> RobotText
     inertial = _below(file, file.named("link", link, file.tags[0]), "inertial")
     below = {t.kind: t for t in file.inside(inertial)}
     stated = {k: float(v) for k, v in below["inertia"].attributes.items()} if "inertia" in below else {}
-    ratio = value / (float(below["mass"].attributes["value"]) if what == "mass" else _largest(stated))
-    changes = [(below["mass"], {"value": repr(value)})] if what == "mass" else []
+    if what == "mass":
+        own, changes = float(below["mass"].attributes["value"]), [(below["mass"], {"value": repr(value)})]
+    else:
+        own, changes = largest_moment(*(stated.get(name, usual) for name, usual in _MOMENTS.items())), []
     if stated:
-        changes.append((below["inertia"], {k: repr(v * ratio) for k, v in stated.items()}))
+        changes.append((below["inertia"], {k: repr(v * (value / own)) for k, v in stated.items()}))
     # From the end on, so that what stands before keeps its place.
     for tag, values in sorted(changes, key=lambda c: -c[0].begin):
         file = file.put(tag, **values)
@@ -123,12 +224,6 @@ def _urdf_com(file: RobotText, link: str, k: int, value: float) -> RobotText:
     place[k] = repr(value)
     xyz = " ".join(place)
     return file.insert(inertial, f'<origin xyz="{xyz}"/>') if origin is None else file.put(origin, xyz=xyz)
-
-
-def _largest(inertia: Mapping[str, float]) -> float:
-    """The largest principal moment of an <inertia>."""
-    xx, yy, zz, xy, xz, yz = (inertia.get(name, usual) for name, usual in _MOMENTS.items())
-    return float(np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])[-1])
 
 
 def _sdf_mass(file: RobotText, model: Tag, link: str, mass: float) -> RobotText:
