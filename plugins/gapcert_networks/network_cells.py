@@ -26,8 +26,8 @@ import numpy.typing as npt
 from gapcert.plugin import Array
 from gapcert_networks.thresholds import THRESHOLDS
 
+from .network_constant import gamma
 from .network_slopes import EPS, PIECEWISE, TINY, gates, lines
-from .positive_definite import gamma
 
 # Sizes (h, k), F and P (h, 1 or k, n), and where F is one for all boxes the products of its entries (h, n²).
 _Block = tuple[Array, Array, Array, Array | None]
