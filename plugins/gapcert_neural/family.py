@@ -16,8 +16,7 @@ from gapcert_networks import Network, raised
 from gapcert_neural.thresholds import THRESHOLDS
 
 from .banded import BandTraining, Pool
-from .covered import CertifiedTraining, Covered, CoverTraining, PaperTraining
-from .shapes import SHAPES
+from .covered import SHAPES, CertifiedTraining, Covered, CoverTraining, PaperTraining
 from .training import Plan, Progress
 
 
