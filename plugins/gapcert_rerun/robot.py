@@ -9,8 +9,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from gapcert import Array
-from gapcert.plugin import Shape
+from gapcert.plugin import Array, Shape
 from gapcert_figures import Motion, Playback
 
 from .canvas import Canvas
