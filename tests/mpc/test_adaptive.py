@@ -20,7 +20,7 @@ from gapcert_mpc.task import STARTS
 from gapcert_mpc.variants.adaptive import Levels
 from gapcert_mpc.variants.membership import Membership
 from gapcert_mpc.variants.parameters import Family, built
-from gapcert_report.pictures.loop import learned_pictures
+from gapcert_report.pictures.control import learned_pictures
 from gapcert_report.words.words import learned_sentence
 
 SPEC = Path(__file__).parents[2] / "specs" / "pendulum_adaptive.yaml"
