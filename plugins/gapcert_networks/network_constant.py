@@ -14,10 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import LinAlgError, cholesky
 
-from gapcert.plugin import Array, UsageError
+from gapcert.plugin import Array, Bools, Ints, UsageError
 from gapcert_networks.thresholds import THRESHOLDS
-
-Integers = npt.NDArray[np.int64]
 
 TINY = float(np.finfo(np.float64).tiny)
 UNIT = 2.0**-53
@@ -101,7 +99,7 @@ def proved(
     return None
 
 
-def rescaled(a: Array, rows: Integers, columns: Integers) -> Array | None:
+def rescaled(a: Array, rows: Ints, columns: Ints) -> Array | None:
     """a_ij·2^(rows_i + columns_j), laid out along the longer side; None where floats do not hold it."""
     if not (rows.any() or columns.any()):
         return a
@@ -223,7 +221,7 @@ def proved_balanced(weights: Sequence[Array], multipliers: Sequence[Array], squa
     return None if found is None else shifted(found, power + exponent, up=True)
 
 
-def trimmed(weights: Sequence[Array]) -> tuple[list[Array], list[npt.NDArray[np.bool_]]]:
+def trimmed(weights: Sequence[Array]) -> tuple[list[Array], list[Bools]]:
     """Without the neurons that change with no input or that change no output; and which ones of each hidden layer are kept."""
     kept = [np.ones(len(w), dtype=bool) for w in weights[:-1]]
     moved, used = np.ones(weights[0].shape[1], dtype=bool), np.ones(len(weights[-1]), dtype=bool)
@@ -239,7 +237,7 @@ def trimmed(weights: Sequence[Array]) -> tuple[list[Array], list[npt.NDArray[np.
     return [w[np.ix_(ends[i + 1], ends[i])] for i, w in enumerate(weights)], kept
 
 
-def balanced(weights: Sequence[Array], units: Array) -> tuple[list[Array], Array, int, list[Integers]]:
+def balanced(weights: Sequence[Array], units: Array) -> tuple[list[Array], Array, int, list[Ints]]:
     """(W′, s′, p, c): W′_i = C_{i+1} W_i C_i⁻¹, C_i = 2^c_i, so that what goes into each neuron is as large as what leaves it.
     The columns of W_0 are first divided by the powers of two above the units: s′ = s/2^k lies in [½, 1).
 
@@ -273,7 +271,7 @@ def _exponents(a: Array) -> npt.NDArray[np.int32]:
     return out
 
 
-def _exact(a: Array, rows: Integers, columns: Integers, where: str) -> Array:
+def _exact(a: Array, rows: Ints, columns: Ints, where: str) -> Array:
     """a_ij·2^(rows_i + columns_j); UsageError where floats do not hold it."""
     out = rescaled(a, rows, columns)
     if out is None:

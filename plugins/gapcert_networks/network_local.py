@@ -16,9 +16,8 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert.plugin import Array, Emit, Event, UsageError, silent
+from gapcert.plugin import Array, Emit, Event, Ints, UsageError, silent
 from gapcert_networks.thresholds import THRESHOLDS
 
 from .network import Network
@@ -155,7 +154,7 @@ def _edges(low: Array, high: Array, cells: int | Sequence[int]) -> tuple[Array, 
     return edges
 
 
-def _bounded(bounds: Cells, low: Array, high: Array) -> tuple[Array, npt.NDArray[np.intp]]:
+def _bounded(bounds: Cells, low: Array, high: Array) -> tuple[Array, Ints]:
     size = CHUNK if bounds.depth == 1 else DEEP
     parts = [
         bounds.within(low[a : a + size], high[a : a + size]).bounds(low[a : a + size], high[a : a + size])

@@ -14,7 +14,7 @@ import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
 
-from gapcert import Array
+from gapcert.plugin import Array, Bools
 from gapcert_figures import Axis
 
 Colour = tuple[int, int, int, int]
@@ -82,7 +82,7 @@ class Plane:
         x = self.shift + 1.2
         return [bar, texts([(x, 1.1, f"{top:.3g} {unit}".removesuffix(" 1").rstrip()), (x, 0.05, "0")])]
 
-    def mask(self, values: npt.NDArray[np.bool_], colour: Colour) -> rr.GridMap:
+    def mask(self, values: Bools, colour: Colour) -> rr.GridMap:
         """The cells (n, n) that are set, in one colour."""
         return self._map(np.where(values[::-1, :, None], np.asarray(colour), 0).astype(np.uint8), "RGBA", None)
 

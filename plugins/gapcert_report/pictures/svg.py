@@ -14,9 +14,8 @@ from html import escape
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert.plugin import Array
+from gapcert.plugin import Array, Bools
 from gapcert_figures import Axis
 from gapcert_report.words.words import power
 
@@ -155,7 +154,7 @@ def heat(ax: Axes, axes: Sequence[Axis], values: Array, top: float, label: str, 
     drawn.outline.set_visible(False)
 
 
-def classes(ax: Axes, axes: Sequence[Axis], parts: Sequence[tuple[npt.NDArray[np.bool_], str, str, float]]) -> list[Any]:
+def classes(ax: Axes, axes: Sequence[Axis], parts: Sequence[tuple[Bools, str, str, float]]) -> list[Any]:
     """A map of disjoint parts (mask, colour, name, opacity), and the legend's entries of those that are not empty."""
     from matplotlib.colors import ListedColormap, to_rgba
     from matplotlib.patches import Patch
