@@ -16,7 +16,7 @@ from gapcert import AdaptiveSampling, GapFunction, Interval, LatticeSampling, St
 from gapcert.contracts.systems.domain import Box, Domain
 from gapcert.plugin import GapProblem, LipschitzBound, Samples, supremum
 from gapcert_bounds.constants.gradient_elite import GradientElite
-from gapcert_bounds.constants.lipschitz import IntervalJacobian
+from gapcert_bounds.constants.interval import IntervalJacobian
 from gapcert_bounds.families.envelope import Envelope
 from gapcert_bounds.families.multilinear import Multilinear
 from gapcert_bounds.testing.fields import Field, lipschitz_problem

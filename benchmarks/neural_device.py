@@ -17,8 +17,7 @@ import numpy as np
 import torch
 
 from gapcert_neural.banded import BandTraining, Pool
-from gapcert_neural.covered import CertifiedTraining, Covered, PaperTraining
-from gapcert_neural.shapes import SHAPES
+from gapcert_neural.covered import SHAPES, CertifiedTraining, Covered, PaperTraining
 from gapcert_neural.training import Plan, Training
 
 WARM, TIMED, STEPS = 40, 200, 2000

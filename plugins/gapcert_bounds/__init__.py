@@ -6,7 +6,7 @@ import sys
 
 from gapcert.plugin import LazyPackage, homes
 
-_HOME = homes({"gapcert_bounds.families.multilinear_predictor": "MultilinearPredictor"})
+_HOME = homes({"gapcert_bounds.families.multilinear": "MultilinearPredictor"})
 
 __all__ = sorted(_HOME)
 sys.modules[__name__].__class__ = LazyPackage

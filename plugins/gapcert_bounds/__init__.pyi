@@ -1,1 +1,1 @@
-from gapcert_bounds.families.multilinear_predictor import MultilinearPredictor as MultilinearPredictor
+from gapcert_bounds.families.multilinear import MultilinearPredictor as MultilinearPredictor

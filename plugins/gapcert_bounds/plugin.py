@@ -7,8 +7,8 @@ import gapcert
 CONFIG = "gapcert_bounds.config"
 _SAMPLED = {"claim": "statistical"}
 _ESTIMATORS: dict[str, tuple[str, str, dict[str, Any]]] = {
-    "declared": ("lipschitz:Declared", "constants that the user states", {}),
-    "interval": ("lipschitz:IntervalJacobian", "constants proved from the equations of both systems", {}),
+    "declared": ("declared:Declared", "constants that the user states", {}),
+    "interval": ("interval:IntervalJacobian", "constants proved from the equations of both systems", {}),
     "wood-zhang": ("wood_zhang:WoodZhang", "constants estimated from sampled slopes by extreme value theory", _SAMPLED),
     "gradient-elite": (
         "gradient_elite:GradientElite", "constants estimated from slopes searched for around the steepest", _SAMPLED,

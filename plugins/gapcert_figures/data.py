@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert.plugin import DAMAGE, TURN, Array, UsageError, clipped, npz_bytes, pretty, turned, write_atomic
+from gapcert.plugin import DAMAGE, TURN, Array, Bools, Ints, UsageError, clipped, npz_bytes, pretty, turned, write_atomic
 from gapcert_closed_loop import Ahead, Foreseen, Learned, followed, foreseen
 from gapcert_closed_loop import figures as learned_figures
 
@@ -167,7 +166,7 @@ class WinningFigure:
     labels: tuple[str, ...] = ("with γ", "without γ")
 
     @property
-    def areas(self) -> tuple[tuple[str, str, npt.NDArray[np.bool_]], ...]:
+    def areas(self) -> tuple[tuple[str, str, Bools], ...]:
         """(role, name, where) of what both win, and of what one wins alone."""
         a, b = self.with_gamma > 0, self.without_gamma > 0
         first, second = self.labels
@@ -198,7 +197,7 @@ class Runs:
         return "with γ" if self.gamma else "without γ"
 
     @property
-    def alive(self) -> npt.NDArray[np.intp]:
+    def alive(self) -> Ints:
         """(steps + 1,): how many are unbroken at each step."""
         broke = np.where(self.broke < 0, self.steps + 1, self.broke)
         return np.asarray((broke[None] > np.arange(self.steps + 1)[:, None]).sum(axis=1))
@@ -446,7 +445,7 @@ def loop_figure(loop: ClosedLoop, model: System, with_gamma: Controller, without
     return made if wanted is None else replace(made, wanted=wanted)
 
 
-def drawn(loop: ClosedLoop) -> npt.NDArray[np.intp]:
+def drawn(loop: ClosedLoop) -> Ints:
     """The runs that are drawn: of the starts that the controller with γ takes, those first that break without γ."""
     return np.argsort(~loop.without_gamma.violation[: len(loop.with_gamma.x)], kind="stable")[:TRACES]
 
@@ -468,7 +467,7 @@ def _escape(trace: Trace, row: int, model: System, controller: Controller) -> Es
     return Escape(axes, inside, end, x[end - 1], expected, x[end])
 
 
-def _runs(gamma: bool, policy: str, trace: Trace, model: System, rows: npt.NDArray[np.intp], stay: Box) -> Runs:
+def _runs(gamma: bool, policy: str, trace: Trace, model: System, rows: Ints, stay: Box) -> Runs:
     last = np.isfinite(trace.x).all(axis=2).sum(axis=1) - 1
     broke = np.where(trace.violation, last, -1)
     x, u = trace.x[rows], trace.u[rows]

@@ -12,11 +12,10 @@ from functools import cache
 from typing import final
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import lapack
 from scipy.optimize import minimize
 
-from gapcert import Array
+from gapcert.plugin import Array, Bools, Ints
 from gapcert_lipsdp.thresholds import THRESHOLDS
 
 BLOCK = 4096  # neurons that are taken at once
@@ -77,7 +76,7 @@ def _sides(columns: Array, length: Array) -> tuple[float, float]:
     return total, float(np.sqrt(0.5 * total * _largest(slope)))
 
 
-def _multipliers(weight: Array, used: npt.NDArray[np.bool_], length: Array, upper: float) -> OneLayer:
+def _multipliers(weight: Array, used: Bools, length: Array, upper: float) -> OneLayer:
     each = np.zeros(len(weight) + 1)
     each[used] = length
     half, own = 0.5 * float(length.sum()), np.maximum(each[:-1], TINY)
@@ -136,7 +135,7 @@ def _step(columns: Array, inverse: Array, x: Array) -> Array | None:
 
 
 @cache
-def _pairs(n: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], Array]:
+def _pairs(n: int) -> tuple[Ints, Ints, Array]:
     """Of the upper triangle by rows: both indices, and how often an entry stands in the matrix."""
     i, j = np.triu_indices(n)
     return i, j, np.where(i == j, 1.0, 2.0)

@@ -10,8 +10,8 @@ _HOME = homes(
     {
         "gapcert_networks.bounds": "NetworkBound NetworkCertifier Proposal",
         "gapcert_networks.network": "Network",
+        "gapcert_networks.network_constant": "proved_balanced",
         "gapcert_networks.network_local": "LocalBound local_bound",
-        "gapcert_networks.scaling": "proved_balanced",
         "gapcert_networks.theorem1_network": "raised",
     }
 )

@@ -14,8 +14,7 @@ from gapcert.plugin import Array, UsageError
 from gapcert_networks.thresholds import THRESHOLDS
 
 from .network import Network
-from .network_constant import proved
-from .scaling import balanced, shifted, trimmed
+from .network_constant import balanced, proved, shifted, trimmed
 
 
 @final

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -98,6 +98,12 @@ class Network(Function):
         return max(len(w) for w in self.weights)
 
     @property
+    def _layers(self) -> Iterator[tuple[Array, Array, str | None]]:
+        """(weights, biases, the activation behind them) of each layer."""
+        names = (*(self.activation,) * (len(self.weights) - 1), self.output)
+        return zip(self.weights, self.biases, names, strict=True)
+
+    @property
     def exponent(self) -> int:
         """2^exponent bounds the product of the largest slopes of all activations."""
         inner = ACTIVATIONS[self.activation][1] * (len(self.weights) - 1)
@@ -108,11 +114,10 @@ class Network(Function):
         z = np.asarray(z, dtype=np.float64)
         if z.ndim != 2 or z.shape[1] != self.n_in:
             raise UsageError(f"network input: found shape {z.shape}; expected (n, {self.n_in}); give one row per point")
-        for i, (w, b) in enumerate(zip(self.weights, self.biases, strict=True)):
+        for w, b, name in self._layers:
             v = np.tile(b, (len(z), 1))
             for k in range(w.shape[1]):
                 v += z[:, k : k + 1] * w[:, k]
-            name = self.activation if i < len(self.weights) - 1 else self.output
             z = v if name is None else ACTIVATIONS[name][0](v)
         return z
 
@@ -170,7 +175,7 @@ class Network(Function):
         centre, h = boxes.mid, boxes.rad
         slope, alpha = np.eye(self.n_in), np.ones((1, self.n_in))
         m, e, size, known = centre, np.zeros_like(centre), h, None
-        for k, (w, b) in enumerate(zip(self.weights, self.biases, strict=True)):
+        for k, (w, b, name) in enumerate(self._layers):
             last = k == len(self.weights) - 1
             w, b = (w[outputs], b[outputs]) if last else (w, b)
             across = np.abs(w).T
@@ -186,7 +191,7 @@ class Network(Function):
                 slope = (alpha[:, None] * w) @ slope if alone else w @ (alpha[:, :, None] * slope)
                 size = (np.abs(slope) * h[:, None, :]).sum(axis=2) * (1 + 4 * g)
             alpha = np.ones((1, len(w)))
-            if (name := self.output if last else self.activation) is not None:
+            if name is not None:
                 r = (size + e) * (1 + 4 * _EPS)
                 if between is not None:
                     between.append(known := slopes(name, m, r))
@@ -231,9 +236,8 @@ class Network(Function):
         )
         for a in range(0, len(z), rows):
             v = z[a : a + rows]
-            for i, (w, b) in enumerate(zip(self.weights, self.biases, strict=True)):
+            for w, b, name in self._layers:
                 v = v @ w.T + b
-                name = self.activation if i < len(self.weights) - 1 else self.output
                 v = v if name is None else ACTIVATIONS[name][0](v)
             found.append(v)
         value = np.concatenate(found)
@@ -242,10 +246,9 @@ class Network(Function):
     def rounding(self, box: Interval) -> Array:
         # With |â − a| ≤ error and |a| ≤ value before a layer, |fl(W â + b) − (W a + b)| ≤ |W| error + γ_{k+1} size.
         error, value = np.zeros(self.n_in), box.mag[0]
-        for i, (w, b) in enumerate(zip(self.weights, self.biases, strict=True)):
+        for w, b, name in self._layers:
             size = np.abs(w) @ (value + error) + np.abs(b)
             error = (np.abs(w) @ error + (w.shape[1] + 2) * _EPS * size) * (1 + 1e-12) + w.shape[1] * _TINY
-            name = self.activation if i < len(self.weights) - 1 else self.output
             value = size * (1 + 1e-12) + 1.0  # no activation but softplus exceeds its argument, and that by less than 1
             if name is not None:
                 error = error + 8 * _EPS * value  # slopes are at most 1
@@ -270,10 +273,9 @@ class Network(Function):
     def _entering(self, boxes: Interval) -> list[Interval]:
         """What enters the activations of each layer, (n, h_i), the output's last."""
         found, v = [], boxes
-        for i, (w, b) in enumerate(zip(self.weights, self.biases, strict=True)):
+        for w, b, name in self._layers:
             found.append(_affine(w, b, v))
-            if i < len(self.weights) - 1:
-                v = _activated(self.activation, found[-1])
+            v = _activated(name, found[-1])
         return found
 
     def _gradient(self, boxes: Interval, i: int) -> Interval:

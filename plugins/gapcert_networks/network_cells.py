@@ -23,11 +23,11 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.plugin import Array
+from gapcert.plugin import Array, Bools, Ints
 from gapcert_networks.thresholds import THRESHOLDS
 
+from .network_constant import gamma
 from .network_slopes import EPS, PIECEWISE, TINY, gates, lines
-from .positive_definite import gamma
 
 # Sizes (h, k), F and P (h, 1 or k, n), and where F is one for all boxes the products of its entries (h, n²).
 _Block = tuple[Array, Array, Array, Array | None]
@@ -97,7 +97,7 @@ class Cells:
 
     def bounds(
         self, lo: Array, hi: Array, target: float = 0.0, before: Array | None = None, held: Held | None = None
-    ) -> tuple[Array, npt.NDArray[np.intp]]:
+    ) -> tuple[Array, Ints]:
         """(Above every gradient norm on each box, the axis along which to split it) of boxes (k, n).
 
         Bounds below a target, or far above it, are not made tighter, unless they are hardly below those known before.
@@ -175,7 +175,7 @@ class Cells:
         p = self.W[i] @ (a * z + mu) + self.b[i][:, None]
         return p, (w @ (a * q)) * (1 + terms) + wrong[:, None], (w @ delta) * (1 + terms), wrong[:, None]
 
-    def _both(self, i: int, a: Array, varies: Array) -> tuple[Array, npt.NDArray[np.intp]]:
+    def _both(self, i: int, a: Array, varies: Array) -> tuple[Array, Ints]:
         """(|W_i·a·W_{i−1}| (k, h, m), the m columns): of the neurons two layers before that vary on one of the boxes.
 
         What they do is added up over the layer between, signs and all.
@@ -311,7 +311,7 @@ def largest(M: Array, trace: Array) -> Array:
     return np.asarray(found * whole * (1 + 8 * n * EPS))
 
 
-def _below(A: Array, value: Array) -> npt.NDArray[np.bool_]:
+def _below(A: Array, value: Array) -> Bools:
     """Is λI − A positive definite for certain? A of trace 1 within rounding, λ ≤ 1."""
     n = A.shape[1]
     B = np.ascontiguousarray(-A.transpose(1, 2, 0))

@@ -11,7 +11,7 @@ from gapcert.plugin import Array, GapFunction, GapProblem, Interval, Undecided, 
 
 from .bounds import NetworkCertifier
 from .network import Network
-from .scaling import proved_balanced
+from .network_constant import proved_balanced
 
 _EPS = float(np.finfo(np.float64).eps)
 _ROWS = 1 << 16

@@ -9,14 +9,11 @@ from pathlib import Path
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Array
+from gapcert.plugin import Array, Ints
 from gapcert_neural.thresholds import THRESHOLDS
 
 from .training import Layers, Plan, Progress, Training
-
-Index = npt.NDArray[np.intp]
 
 
 @final
@@ -30,15 +27,15 @@ class Pool:
     z: Array
     t: Array
     signs: Array
-    starts: Index
+    starts: Ints
 
     @classmethod
-    def sorted(cls, z: Array, t: Array, signs: Array, cell: Index) -> Pool:
+    def sorted(cls, z: Array, t: Array, signs: Array, cell: Ints) -> Pool:
         order = np.argsort(cell, kind="stable")
         _, first = np.unique(cell[order], return_index=True)
         return cls(z[order], t[order], signs, np.append(first, len(z)))
 
-    def batch(self, rng: np.random.Generator) -> Index:
+    def batch(self, rng: np.random.Generator) -> Ints:
         """(cells, points): numbers of points, drawn with replacement within cells drawn without."""
         cells = rng.permutation(len(self.starts) - 1)[: THRESHOLDS.batch_cells]
         count = np.diff(self.starts)[cells]

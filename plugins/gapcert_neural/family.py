@@ -9,15 +9,13 @@ from typing import Any, Literal, final
 
 import numpy as np
 
-from gapcert import Array, GapFunction, UsageError
-from gapcert.plugin import GapFamily, GapProblem, Pulse
+from gapcert.plugin import Array, GapFamily, GapFunction, GapProblem, Pulse, UsageError
 from gapcert_functions import Table, band, dominate
 from gapcert_networks import Network, raised
 from gapcert_neural.thresholds import THRESHOLDS
 
 from .banded import BandTraining, Pool
-from .covered import CertifiedTraining, Covered, CoverTraining, PaperTraining
-from .shapes import SHAPES
+from .covered import SHAPES, CertifiedTraining, Covered, CoverTraining, PaperTraining
 from .training import Plan, Progress
 
 

@@ -153,8 +153,7 @@ class Training(ABC):
             return self.torch.maximum(v, 0.01 * v)
         if name == "softplus":
             return self.torch.nn.functional.softplus(v)
-        named = {"relu": "relu", "tanh": "tanh", "sigmoid": "sigmoid", "arctan": "arctan"}
-        return getattr(self.torch, named[name])(v)
+        return getattr(self.torch, name)(v)
 
     def _advance(self, theta: Any, m: Any, v: Any) -> None:
         done = self.step / self.plan.steps

@@ -21,7 +21,7 @@ def inspect(options: Arguments) -> Answer:
 
 
 def report(options: Arguments) -> Answer:
-    from .report import write_report
+    from .pages.page import write_report
 
     path = str(write_report(Path(options.run)))
     return Answer({"report": path}, [path])

@@ -20,7 +20,7 @@ from gapcert_figures import (
     winning_figure,
 )
 
-from .words.markdown import markdown
+from .words.summary import markdown
 
 
 @final

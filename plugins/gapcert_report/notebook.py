@@ -9,19 +9,18 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, final
 
 from gapcert.plugin import View, times
 
 from .pages.html import Html, h, join, legend, table
 from .words import words
-from .words.words import number
+from .words.words import Summary, number
 
 if TYPE_CHECKING:
     from .pictures.svg import Picture
 
-Summary = Mapping[str, Any]
 MOST = 2  # pictures: a cell's output is read in passing
 ROWS = 12  # of a table; more are counted
 _SPENT = {"lipschitz": "constants", "symmetry": "the check of the symmetry"}

@@ -19,7 +19,7 @@ def gapcert_components() -> list[Component]:
     """Pages, pictures and words."""
     return [
         Component("illustrator", "figures", "figures of what stages have found", "gapcert_report.illustrator:Illustrator"),
-        Component("report", "html", "a run folder as one page", "gapcert_report.report:write_report"),
+        Component("report", "html", "a run folder as one page", "gapcert_report.pages.page:write_report"),
         Component(
             "command",
             "inspect",

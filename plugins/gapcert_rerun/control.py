@@ -10,8 +10,7 @@ import rerun as rr
 from gapcert import Array
 from gapcert_figures import LoopFigure, Runs, WinningFigure, held
 
-from .canvas import Canvas
-from .plane import BAD, FAINT, ONLY_WITH, ROLES, TRUTH, WITH, Colour, Plane, Seen, series
+from .canvas import BAD, FAINT, ONLY_WITH, ROLES, TRUTH, WITH, Canvas, Colour, Plane, Seen, series
 from .robot import as_path, draw_robot
 
 

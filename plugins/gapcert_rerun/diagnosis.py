@@ -11,8 +11,7 @@ import rerun.blueprint as rrb
 from gapcert import Array
 from gapcert_figures import Axis, DiagnosisFigure
 
-from .canvas import Canvas
-from .plane import FAINT, ROLES, TRUTH, WITH, Seen, series
+from .canvas import FAINT, ROLES, TRUTH, WITH, Canvas, Seen, series
 from .robot import draw_robot
 
 BOTH = ("before", "after")

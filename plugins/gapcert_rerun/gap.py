@@ -1,14 +1,14 @@
-"""How wrong a model is: maps of the gap beside γ, residuals in their bands, and the windows of a recording."""
+"""How wrong a model is: maps of the gap beside γ, residuals in bands, windows of a recording; and where simulators differ."""
 
 from __future__ import annotations
 
 import numpy as np
 import rerun as rr
 
-from gapcert_figures import Axis, Band, GapFigure, RecordedFigure, held, labelled
+from gapcert import Array
+from gapcert_figures import Axis, Band, CompareFigure, GapFigure, RecordedFigure, held, labelled
 
-from .canvas import Canvas
-from .plane import FAINT, GOOD, STEP, TRUTH, WITH, Colour, Plane, Seen, series
+from .canvas import FAINT, GOOD, STEP, TRUTH, WITH, WITHOUT, Canvas, Colour, Plane, Seen, series
 
 _TUBE: Colour = (70, 108, 165, 255)
 _REACH: Colour = (36, 54, 82, 255)
@@ -64,3 +64,25 @@ def draw_recorded(canvas: Canvas, f: RecordedFigure) -> None:
         canvas.line(f"{root}/residual", s.t, s.residual, TRUTH, "x⁺ − f", 2.0)
         pad, title = 0.1 * (top - bottom) or 1.0, f"gap of {labelled(s.state, s.unit)} as measured (white) in its band"
         canvas.show("stretch", s.state, series(root, title, bottom - pad, top + pad, float(s.t[-1])))
+
+
+def draw_comparison(canvas: Canvas, comparison: CompareFigure) -> None:
+    """Per pair that differs where it does, and how common runs of all pairs come apart."""
+    end = 0.0
+    for p in comparison.pairs:
+        name = f"{p.a} against {p.b}"
+        if p.values.size:
+            root, top = f"pair/{p.a}-{p.b}", float(np.nanmax(p.values))
+            plane = canvas.plane(root, p.axes[0], p.axes[1], f"one step of {p.state} differs by")
+            canvas.static(f"{root}/map", plane.heat(p.values, top))
+            canvas.static(f"{root}/scale", *plane.scale(top, p.unit))
+            canvas.show("pair", root, Seen(root, f"{name}{f', {p.fixed}' if p.fixed else ''}", bar=True))
+        if p.drift.size:
+            # On a linear axis only the order of magnitude shows them all.
+            t = comparison.period * np.arange(len(p.drift), dtype=np.float64)
+            level: Array = np.log10(np.maximum(p.drift, 1e-18))
+            canvas.line(f"drift/{p.a}-{p.b}", t, level, WITHOUT if p.values.size else GOOD, name)
+            end = max(end, float(t[-1]))
+    if end:
+        title = "How runs come apart: log10 of their difference over one step's motion"
+        canvas.show("drift", "drift", series("drift", title, -18.5, 3.0, end))

@@ -7,8 +7,7 @@ from typing import Any
 
 import rerun.blueprint as rrb
 
-from .canvas import Canvas
-from .plane import Seen
+from .canvas import Canvas, Seen
 
 Views = Mapping[str, Mapping[str, Any]]
 _STACKED = 3

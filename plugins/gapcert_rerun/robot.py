@@ -9,12 +9,10 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from gapcert import Array
-from gapcert.plugin import Shape
+from gapcert.plugin import Array, Shape
 from gapcert_figures import Motion, Playback
 
-from .canvas import Canvas
-from .plane import BAD, ROLES
+from .canvas import BAD, ROLES, Canvas
 
 _ASIDE, _ABOVE, _AWAY = 0.4, 0.3, 2.1
 _GHOST = 0.35

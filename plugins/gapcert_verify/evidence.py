@@ -13,7 +13,7 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.plugin import DAMAGE, Array, Interval, Relation, UsageError, Zone, clipped, grid_at, grid_size
+from gapcert.plugin import DAMAGE, Array, Interval, Ints, Relation, UsageError, Zone, clipped, grid_at, grid_size
 from gapcert_functions import Expression, Factor
 
 from .multilinear import band, predicted
@@ -161,7 +161,7 @@ def leaves(e: Evidence) -> list[Interval]:
     return [found[c] for c in sorted(found)]
 
 
-def located(e: Evidence, z: Array) -> npt.NDArray[np.int64]:
+def located(e: Evidence, z: Array) -> Ints:
     """(n,) which of the parts each point belongs to; on a shared face, the lower one."""
     if "cells.L" not in e.arrays or not len(e.arrays["cells.axis"]):
         return np.zeros(len(z), dtype=np.int64)
@@ -196,7 +196,7 @@ def grid(data: Mapping[str, Any], size: int) -> Array:
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
 
 
-def extremes(data: Mapping[str, Any], cells: Sequence[int], z: Array, records: npt.NDArray[Any]) -> npt.NDArray[np.intp]:
+def extremes(data: Mapping[str, Any], cells: Sequence[int], z: Array, records: npt.NDArray[Any]) -> Ints:
     """Rows that hold the smallest or the largest r_i of a coarse cell; of equal ones that with the lowest index."""
     low, width = np.asarray(data["domain"]["low"]), np.subtract(data["domain"]["high"], data["domain"]["low"])
     place = np.minimum(((z - low) * (np.asarray(cells) / width)).astype(np.int64), np.asarray(cells) - 1)

@@ -20,10 +20,9 @@ from gapcert.plugin import DAMAGE, Array, Interval, UsageError, on_curvature
 
 from . import statements as stated
 from .calibration import calibrated, further, names, noise, windows
-from .constant_bound import exceeds
 from .evidence import Evidence, Part, another, bounds, distance, load, predictor
 from .margin import margin
-from .proofs import bent, dominates, follows
+from .proofs import bent, dominates, exceeds, follows
 
 ROUTES = {
     "envelope": ("dominate",),

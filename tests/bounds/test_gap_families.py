@@ -15,11 +15,10 @@ import gapcert_functions
 from gapcert.testing import GapFamilyContract
 from gapcert_bounds.config import BasisConfig, ConstantConfig, EnvelopeConfig
 from gapcert_bounds.families import cone
-from gapcert_bounds.families.basis import Basis, own_slope, shortfall
+from gapcert_bounds.families.basis import Basis, own_slope, parse, shortfall
 from gapcert_bounds.families.constant import Constant
 from gapcert_bounds.families.envelope import Envelope
 from gapcert_bounds.families.multilinear import Multilinear
-from gapcert_bounds.families.terms import parse
 from gapcert_bounds.testing.fields import Kink, Waves, gap_problem, lattice
 
 NAMES = ("x0", "x1", "u0")

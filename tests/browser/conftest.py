@@ -98,7 +98,7 @@ def page_of(request, small_run):
 @pytest.fixture
 def page_of_a_diagnosis(tmp_path, every_picture):
     from gapcert_figures.data import Figures
-    from gapcert_report.report import write_report
+    from gapcert_report.pages.page import write_report
 
     Figures(diagnosis=every_picture).save(tmp_path)
     (tmp_path / "extended.yaml").write_text("model: extended\n")
@@ -111,7 +111,7 @@ def page_of_a_diagnosis(tmp_path, every_picture):
 def page_of_a_failure(small_run, tmp_path):
     """The small run as if its audit had refuted it, one of a matrix, under a name that no run would have."""
     from gapcert_figures.data import Figures
-    from gapcert_report.report import write_report
+    from gapcert_report.pages.page import write_report
 
     def change(name="small", figures=None):
         (figures or Figures.load(small_run.folder)).save(tmp_path)
@@ -174,7 +174,7 @@ def page_of_an_undecided_run(small_run, tmp_path):
 
 def _changed(run, folder, change, **figures):
     from gapcert_figures.data import Figures
-    from gapcert_report.report import write_report
+    from gapcert_report.pages.page import write_report
 
     replace(Figures.load(run.folder), **figures).save(folder)
     summary = json.loads((run.folder / "summary.json").read_text())

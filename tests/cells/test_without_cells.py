@@ -25,7 +25,7 @@ from gapcert_closed_loop.prediction import Foreseen, foreseen
 from gapcert_figures.data import Figures, loop_figure, winning_figure
 from gapcert_report.pages.diagnosis import _controllers
 from gapcert_report.pages.page import _policies
-from gapcert_report.pictures.loop import foresight_pictures
+from gapcert_report.pictures.control import foresight_pictures
 from gapcert_report.words.diagnosis import won, won_sentence
 from gapcert_report.words.summary import in_words
 from gapcert_report.words.words import loop_sentence

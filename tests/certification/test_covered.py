@@ -10,7 +10,7 @@ import pytest
 import gapcert
 import gapcert_networks
 from gapcert_bounds.testing.fields import Waves, gap_problem
-from gapcert_networks.scaling import proved_balanced
+from gapcert_networks.network_constant import proved_balanced
 
 GRID = (6, 6, 6)
 

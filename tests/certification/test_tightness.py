@@ -12,7 +12,7 @@ from rough_fields import Bump
 
 import gapcert as gc
 from gapcert.certification.samples.designs import _ends, _Watch
-from gapcert_bounds.constants.lipschitz import IntervalJacobian
+from gapcert_bounds.constants.interval import IntervalJacobian
 from gapcert_bounds.families.envelope import Envelope
 from gapcert_bounds.testing.fields import Field, Nothing, Waves, gap_problem
 from gapcert_verify.verify import verify_run

@@ -317,7 +317,7 @@ def test_verify_returns_its_verdict(monkeypatch, capsys, tmp_path):
 
 
 def test_report_says_where_it_is(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr("gapcert_report.report.write_report", lambda folder: folder / "report.html")
+    monkeypatch.setattr("gapcert_report.pages.page.write_report", lambda folder: folder / "report.html")
     assert main(["report", str(tmp_path), "--json"]) == 0
     assert one_object(capsys.readouterr().out) == {"report": str(tmp_path / "report.html")}
 

@@ -201,7 +201,7 @@ def test_what_hangs_can_be_stopped(tmp_path, bad, number, what):
 # The processes that are killed begin with what the first of them has imported.
 STAGES = """
 import os, signal, sys
-import gapcert as gc, gapcert.run, gapcert_report.report, gapcert_symbolic.synthesizer
+import gapcert as gc, gapcert.run, gapcert_report.pages.page, gapcert_symbolic.synthesizer
 
 def killed_at(k):
     count = 0

@@ -10,6 +10,7 @@ from gapcert.contracts.systems.system import StateSpec
 from gapcert_diagnosis.figure import _correlations
 from gapcert_figures.data import Axis, Escape
 from gapcert_figures.diagnosis import Channel, Correlation, Course, DiagnosisFigure, Law
+from gapcert_report.pictures.control import escape_picture
 from gapcert_report.pictures.diagnosis import (
     channel_picture,
     correlation_picture,
@@ -18,7 +19,6 @@ from gapcert_report.pictures.diagnosis import (
     gain_picture,
     law_picture,
 )
-from gapcert_report.pictures.loop import escape_picture
 from gapcert_report.pictures.svg import draw
 
 

@@ -11,8 +11,7 @@ from gapcert_cells import AutomatonController, GridController
 from gapcert_figures import Axis, LoopFigure, WinningFigure
 from gapcert_figures.data import Figures, Runs, winning_figure
 from gapcert_figures.region_outlines import outlines_of
-from gapcert_report.pictures.loop import trace_picture
-from gapcert_report.pictures.plane import runs_picture, value_picture, winning_picture
+from gapcert_report.pictures.control import runs_picture, trace_picture, value_picture, winning_picture
 
 AXES = (StateSpec("h", "rad", "angle"), StateSpec("x", "m"), StateSpec("z", "m"))
 STAY = Box(AXES, (-np.pi, -1.0, 0.0), (np.pi, 1.0, 2.0))

@@ -14,8 +14,7 @@ import gapcert as gc
 from gapcert.certification.samples.designs import AdaptiveSampling, GridSampling
 from gapcert.contracts.gaps.gap import FitRoute
 from gapcert.numerics.intervals import Interval
-from gapcert_bounds.families.basis import Basis
-from gapcert_bounds.families.terms import parse
+from gapcert_bounds.families.basis import Basis, parse
 from gapcert_functions.sums import WeightedSum, term
 from gapcert_verify.verify import verify_run
 

@@ -19,7 +19,7 @@ from gapcert_mpc.synthesizer import Mpc
 from gapcert_mpc.task import STARTS
 from gapcert_mpc.variants.adaptive import Levels
 from gapcert_mpc.variants.parameters import Family, Membership, built
-from gapcert_report.pictures.loop import learned_pictures
+from gapcert_report.pictures.control import learned_pictures
 from gapcert_report.words.words import learned_sentence
 
 SPEC = Path(__file__).parents[2] / "specs" / "pendulum_adaptive.yaml"

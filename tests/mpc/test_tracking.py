@@ -20,7 +20,7 @@ from gapcert_mpc.controller import MpcController
 from gapcert_mpc.planning.design import Course
 from gapcert_mpc.program.solver import Piqp, Qp
 from gapcert_mpc.synthesizer import Mpc
-from gapcert_report.pictures.loop import wanted_pictures
+from gapcert_report.pictures.control import wanted_pictures
 
 Array = np.ndarray
 GAP = Band((-1.5e-4, -6e-5), (1.5e-4, 6e-5))

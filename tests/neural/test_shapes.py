@@ -10,9 +10,8 @@ import gapcert_networks
 from gapcert.contracts.gaps.gap import GapFamily
 from gapcert_bounds.testing.contracts import GapFamilyContract
 from gapcert_bounds.testing.fields import Waves, gap_problem
-from gapcert_neural.covered import Covered
+from gapcert_neural.covered import SHAPES, Covered
 from gapcert_neural.family import Neural
-from gapcert_neural.shapes import SHAPES
 from gapcert_neural.training import Plan
 
 

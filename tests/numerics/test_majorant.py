@@ -15,8 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gapcert as gc
-from gapcert_bounds.families.basis import BasisGap
-from gapcert_bounds.families.terms import parse
+from gapcert_bounds.families.basis import BasisGap, parse
 from gapcert_bounds.testing.fields import Waves, gap_problem
 
 Array = np.ndarray

@@ -7,9 +7,9 @@ import pytest
 
 from gapcert_figures.data import Figures
 from gapcert_figures.diagnosis import called
-from gapcert_report.report import write_report
+from gapcert_report.pages.page import write_report
 from gapcert_report.words.diagnosis import lacking, plus_minus, refitted_named, sentence, shrunk, won
-from gapcert_report.words.markdown import markdown
+from gapcert_report.words.summary import markdown
 
 COULOMB = {
     "effect": "coulomb-friction",

@@ -11,10 +11,9 @@ from gapcert import Event, UsageError
 from gapcert.contracts.plugins.events import silent
 from gapcert_figures.data import Band, Figures, Lane, gap_figure
 from gapcert_report.illustrator import Illustrator
+from gapcert_report.pages.page import write_report
 from gapcert_report.pictures.gap import band_pictures
-from gapcert_report.report import write_report
-from gapcert_report.words.markdown import markdown
-from gapcert_report.words.summary import in_words
+from gapcert_report.words.summary import in_words, markdown
 from gapcert_report.words.words import claim_sentence, loop_sentence, number, plain, refutation, witness_sentence
 
 SCRIPTS = re.compile(r"<script( type=\"application/json\")?>(.*?)</script>", re.S)

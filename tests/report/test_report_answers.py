@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 
-from gapcert_report.report import write_report
+from gapcert_report.pages.page import write_report
 from gapcert_report.words.words import some, symbols
 
 MET = {"text": "verdict == holds", "value": "holds", "met": True}

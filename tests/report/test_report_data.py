@@ -13,11 +13,10 @@ from hypothesis import strategies as st
 
 import gapcert as gc
 from gapcert_figures.data import Figures
-from gapcert_report.harvest import packed
+from gapcert_report.pages.page import write_report
 from gapcert_report.pictures.album import album_of
 from gapcert_report.pictures.gap import band_pictures, slice_pictures
-from gapcert_report.pictures.svg import draw, heat
-from gapcert_report.report import write_report
+from gapcert_report.pictures.svg import draw, heat, packed
 from gapcert_report.words.words import tightness_sentence
 
 DATA = re.compile(r'<script type="application/json">(.*?)</script>', re.S)

@@ -7,7 +7,7 @@ import pytest
 
 from gapcert import UsageError
 from gapcert_figures.data import Figures
-from gapcert_report.report import write_report
+from gapcert_report.pages.page import write_report
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ import gapcert as gc
 from gapcert.certification.refutation import contradiction
 from gapcert.contracts.gaps.predictor import Samples
 from gapcert.numerics.constraint_zone import Relation
-from gapcert_bounds.constants.lipschitz import IntervalJacobian
+from gapcert_bounds.constants.interval import IntervalJacobian
 from gapcert_bounds.families.envelope import Envelope, EnvelopeGap
 from gapcert_bounds.testing.fields import Kink, Nothing, Waves, lattice, lipschitz_problem
 from gapcert_verify.verify import verify_run

@@ -10,8 +10,7 @@ import pytest
 import gapcert as gc
 from gapcert.certification.refutation import curvature_contradiction
 from gapcert_bounds import MultilinearPredictor
-from gapcert_bounds.constants.interval_curvature import merged
-from gapcert_bounds.constants.lipschitz import IntervalJacobian
+from gapcert_bounds.constants.interval import IntervalJacobian, merged
 from gapcert_bounds.families.multilinear import Multilinear
 from gapcert_bounds.testing.fields import Kink, Waves, lattice, lipschitz_problem
 from gapcert_equations.config import EquationsConfig

@@ -17,7 +17,7 @@ from rough_fields import Bump
 import gapcert as gc
 from gapcert.contracts.gaps.gap import FitRoute
 from gapcert.contracts.gaps.predictor import Samples
-from gapcert_bounds.constants.lipschitz import IntervalJacobian
+from gapcert_bounds.constants.interval import IntervalJacobian
 from gapcert_bounds.families.basis import Basis
 from gapcert_bounds.families.constant import Constant
 from gapcert_bounds.families.envelope import Envelope

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 import gapcert as gc
 import gapcert_networks
 from gapcert_lipsdp.lipsdp import LipSDP
-from gapcert_networks.network_constant import proved, rescaled
-from gapcert_networks.positive_definite import positive_definite
+from gapcert_networks.network_constant import positive_definite, proved, rescaled
 
 HALF = [np.array([[1.0]]), np.array([[0.5]])]  # ½ relu(x)
 FLAT = [np.array([[1.0], [1.0]]), np.array([[1.0, -1.0]])]  # relu(x + 1) − relu(x − 1), with its biases

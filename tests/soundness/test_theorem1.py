@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from rough_fields import Coarse
 
 import gapcert as gc
-from gapcert_bounds.families.basis import Basis, BasisGap, scenario, shortfall
+from gapcert_bounds.families.basis import Basis, BasisGap, parse, scenario, shortfall
 from gapcert_bounds.families.constant import Constant, ConstantGap
-from gapcert_bounds.families.terms import parse
 from gapcert_bounds.testing.fields import Field, Kink, Waves, gap_problem
 
 FUNCTIONS = ("1", "x0^2", "sin(x1)", "abs(u0)", "cos(2*x0)")

@@ -12,8 +12,8 @@ import gapcert as gc
 from gapcert.certification.routes import Request
 from gapcert.certification.samples.designs import GridSampling
 from gapcert.testing.toys import Drift, Perturbed, ripple
-from gapcert_verify.constant_bound import _exceeds
 from gapcert_verify.evidence import load
+from gapcert_verify.proofs import _exceeds
 from gapcert_verify.verify import verify_run
 
 VALUES = {"x0": {"x0": 0.03, "u0": 0.08}}

@@ -7,10 +7,8 @@ from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Array, UsageError
-from gapcert.plugin import LipschitzProblem
+from gapcert.plugin import Array, Bools, Ints, LipschitzProblem, UsageError
 from gapcert_bounds.thresholds import THRESHOLDS
 
 from .slopes import around
@@ -127,7 +125,7 @@ def _beside(z: Array, step: Array, j: int) -> tuple[Array, Array]:
     return low, high
 
 
-def _room(problem: LipschitzProblem, z: Array, step: Array, j: int) -> npt.NDArray[np.bool_]:
+def _room(problem: LipschitzProblem, z: Array, step: Array, j: int) -> Bools:
     low, high = _beside(z, step, j)
     return np.asarray(problem.domain.contains(z) & problem.domain.contains(low) & problem.domain.contains(high))
 
@@ -156,7 +154,7 @@ class _Trails:
     of state i that began at random.
     """
 
-    state: npt.NDArray[np.intp]
+    state: Ints
     step: Array
     size: Array
     spent: int

@@ -6,11 +6,8 @@ from dataclasses import dataclass, field
 from typing import final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Array, Domain, Interval
-
-Index = npt.NDArray[np.intp]
+from gapcert.plugin import Array, Bools, Domain, Interval, Ints
 
 
 @final
@@ -30,15 +27,20 @@ class Leaf:
     def width(self) -> Array:
         return self.high - self.low
 
-    def holds(self, low: Array, high: Array) -> npt.NDArray[np.bool_]:
+    def holds(self, low: Array, high: Array) -> Bools:
         """(n,): the closed box meets the boxes [low, high] (n, nz)."""
         return np.asarray(((low <= self.high) & (high >= self.low)).all(axis=1))
 
-    def within(self, domain: Domain, z: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
+    def within(self, domain: Domain, z: Array) -> tuple[Array, Bools]:
         """(points z (n, nz) moved into Z, which of them then lie in Z and in the closed box)."""
         boxes = Interval(np.broadcast_to(self.low, z.shape), np.broadcast_to(self.high, z.shape))
         moved = domain.inside(z, boxes)
         return moved, np.asarray(domain.contains(moved) & self.holds(moved, moved))
+
+    def point(self, domain: Domain) -> Array | None:
+        """A point of Z in the cell: its middle, moved where relations ask for it; None where none is found."""
+        (point,), (known,) = self.within(domain, Interval(self.low[None], self.high[None]).mid)
+        return point if known else None
 
     def halves(self, axis: int, cut: float) -> tuple[Leaf, Leaf]:
         """The two sides of a cut; they keep the region."""
@@ -75,7 +77,7 @@ class Tree:
             half.slot = (node, side)
         self.leaves[at : at + 1] = halves
 
-    def cuts(self) -> tuple[Index, Array, Index]:
+    def cuts(self) -> tuple[Ints, Array, Ints]:
         """(axis, cut, child) with the leaves numbered in their order here."""
         child = [list(pair) for pair in self._child]
         for number, leaf in enumerate(self.leaves):
@@ -85,7 +87,7 @@ class Tree:
         return np.array(self._axis, dtype=np.intp), np.array(self._cut, dtype=np.float64), shape
 
 
-def edges(nz: int) -> tuple[Index, Index, Index]:
+def edges(nz: int) -> tuple[Ints, Ints, Ints]:
     """(corner, other corner, axis) of every edge of a box, corners numbered as in `Leaf.corners`."""
     numbers = np.arange(1 << nz)
     parts = [(numbers[(numbers >> j) & 1 == 0], j) for j in range(nz)]

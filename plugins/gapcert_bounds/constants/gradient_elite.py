@@ -6,13 +6,11 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert import Array, UsageError
-from gapcert.plugin import LipschitzBound, LipschitzEstimator, LipschitzProblem
+from gapcert.plugin import Array, LipschitzBound, LipschitzEstimator, LipschitzProblem, UsageError
 from gapcert_bounds.thresholds import THRESHOLDS
 
 from .bends import curvatures
-from .slopes import Close, around, inert, uniform
-from .sweep import Curvature, estimate
+from .slopes import Close, Curvature, around, estimate, inert, uniform
 
 
 @final

@@ -8,11 +8,10 @@ from typing import final
 import numpy as np
 
 from gapcert import Array, UsageError
-from gapcert.plugin import Bools, Cells, LipschitzBound, LipschitzEstimator, LipschitzProblem
+from gapcert.plugin import Bools, Cells, Ints, LipschitzBound, LipschitzEstimator, LipschitzProblem, Trails, follow
 from gapcert_bounds.thresholds import THRESHOLDS
 
 from .cell_tree import Leaf, Tree, edges
-from .pairs import Answers, Index, Pairs
 
 
 @final
@@ -117,7 +116,7 @@ class _Search:
             jumped[rows] = True
         self.pairs.drop(np.concatenate([jumped, np.zeros(len(self.pairs.axis) - len(jumped), dtype=bool)]))
 
-    def _pursue(self, segments: Array, state: Index, enough: Array | None = None) -> Bools:
+    def _pursue(self, segments: Array, state: Ints, enough: Array | None = None) -> Bools:
         """Follow segments for one state each: jumps are recorded, settled slopes become pairs; (n,) where one jumped."""
         long = (np.abs(segments[:, 1] - segments[:, 0]) / self.domain.width).max(axis=1)
         steps = np.ceil(np.log(np.maximum(long * THRESHOLDS.trail_end / self.options.thinnest, 1.0)) / np.log(4.0)).astype(
@@ -156,7 +155,7 @@ class _Search:
             best, halves = 0.8 * self._looseness(leaf), None
             for j in range(len(leaf.low)):
                 pair = leaf.halves(j, float((leaf.low[j] + leaf.high[j]) / 2))
-                if all(self._own_region(half) for half in pair) and all(self._point(half) is not None for half in pair):
+                if all(self._own_region(half) for half in pair) and all(half.point(self.domain) is not None for half in pair):
                     loose = (self._looseness(pair[0]) + self._looseness(pair[1])) / 2
                     if loose < best:
                         best, halves = loose, (j, pair)
@@ -173,17 +172,6 @@ class _Search:
         if self.pairs.count(self.pairs.within(leaf.low, leaf.high), self.axes) >= THRESHOLDS.cell_pairs:
             leaf.region = (leaf.low, leaf.high)
         return leaf.region[0] is leaf.low
-
-    def _point(self, leaf: Leaf) -> Array | None:
-        """A point of Z in the leaf, or None where none is found."""
-        box = np.stack([leaf.low, leaf.high])
-        inside = self._inside(leaf, box.mean(axis=0)[None])
-        return inside[0] if len(inside) else None
-
-    def _inside(self, leaf: Leaf, z: Array) -> Array:
-        """Points z of the leaf, moved into Z; those that cannot be are left out."""
-        moved, known = leaf.within(self.domain, z)
-        return np.asarray(moved[known])
 
     def _split_by_jump(self) -> None:
         """Halve the cells whose jumps cost most, across the jump; a jump is pursued from cell to cell along their edges."""
@@ -203,7 +191,7 @@ class _Search:
     def _halve(self, leaf: Leaf) -> tuple[Leaf, ...]:
         axis = self._across(leaf)
         pair = leaf.halves(axis, float((leaf.low[axis] + leaf.high[axis]) / 2))
-        if any(self._point(half) is None for half in pair):
+        if any(half.point(self.domain) is None for half in pair):
             leaf.whole = True
             return ()
         for half in pair:
@@ -280,16 +268,18 @@ class _Search:
     def _corners(self, leaf: Leaf) -> tuple[Array, Bools]:
         """(corners moved into Z, which of them are in Z and in the leaf); the others stand at the leaf's point."""
         moved, known = leaf.within(self.domain, leaf.corners())
-        stand_in = self._point(leaf)
+        stand_in = leaf.point(self.domain)
         return np.where(known[:, None], moved, stand_in if stand_in is not None else self.domain.centre), known
 
     def _conclude(self) -> LipschitzBound:
         leaves = self.tree.leaves
         made = [self._cell(leaf) for leaf in leaves]
         constants, sizes = np.array([c for c, _ in made]), np.array([j for _, j in made])
-        anchors = [point for leaf in leaves if (point := self._point(leaf)) is not None]
+        anchors = [point for leaf in leaves if (point := leaf.point(self.domain)) is not None]
         for leaf, size in zip(leaves, sizes, strict=True):
-            anchors += list(self._inside(leaf, leaf.corners())) if size.any() else []
+            if size.any():
+                moved, known = leaf.within(self.domain, leaf.corners())
+                anchors += list(moved[known])
         anchors = list(np.unique(np.array(anchors), axis=0))
         cells = Cells(self.tree.low, self.tree.high, *self.tree.cuts(), constants, sizes, np.array(anchors))
         lower = (
@@ -336,3 +326,79 @@ class _Search:
             else:
                 constants[i] *= self.options.safety * ratio
         return constants, jumps
+
+
+@final
+class Answers:
+    """g at every point that was asked about: z (n, nz), g (n, nx). Each is asked once, each round under a name of its own."""
+
+    def __init__(self, problem: LipschitzProblem) -> None:
+        self.problem = problem
+        self.z, self.g = np.empty((0, len(problem.domain.low))), np.empty((0, problem.domain.nx))
+        self._row: dict[bytes, int] = {}
+        self._rounds = 0
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+    def __call__(self, z: Array) -> Array:
+        """g at points z (n, nz)."""
+        keys = [row.tobytes() for row in np.ascontiguousarray(z) + 0.0]
+        fresh: dict[bytes, int] = {}
+        for k, key in enumerate(keys):
+            if key not in self._row:
+                fresh.setdefault(key, k)
+        if fresh:
+            new = z[list(fresh.values())]
+            g = self.problem.remainder(f"lipschitz-{self._rounds:03d}", new)
+            self._rounds += 1
+            self._row |= {key: len(self.z) + k for k, key in enumerate(fresh)}
+            self.z, self.g = np.concatenate([self.z, new]), np.concatenate([self.g, g])
+        return np.asarray(self.g[[self._row[key] for key in keys]])
+
+    def follow(self, z: Array, state: Ints, noise: Array, steps: Ints, enough: Array | None) -> Trails:
+        """Segments z (n, 2, nz) of known ends, each followed for its state."""
+        ends = self(z.reshape(-1, z.shape[2])).reshape(len(z), 2, -1)
+        return follow(lambda _, points: self(points), z, ends, state, noise, steps, enough)
+
+
+@final
+class Pairs:
+    """Segments along single axes across which nothing jumps: ends (n, 2, nz), axis (n,), change (n, nx) = |Δg|."""
+
+    def __init__(self, nz: int, nx: int) -> None:
+        self._keep(np.empty((0, 2, nz)), np.empty(0, dtype=np.intp), np.empty((0, nx)))
+
+    def _keep(self, ends: Array, axis: Ints, change: Array) -> None:
+        self.ends, self.axis, self.change = ends, axis, change
+        rows = np.arange(len(axis))
+        self.length = ends[rows, 1, axis] - ends[rows, 0, axis]
+        self.middle = (ends[:, 0] + ends[:, 1]) / 2
+
+    def add(self, ends: Array, axis: Ints, change: Array) -> None:
+        axes = np.concatenate([self.axis, axis])
+        self._keep(np.concatenate([self.ends, ends]), axes, np.concatenate([self.change, change]))
+
+    def drop(self, rows: Bools) -> None:
+        self._keep(self.ends[~rows], self.axis[~rows], self.change[~rows])
+
+    def within(self, low: Array, high: Array) -> Bools:
+        """(n,): the middle lies in the box."""
+        inside = np.ones(len(self.axis), dtype=bool)
+        for j in range(len(low)):
+            inside &= (self.middle[:, j] >= low[j]) & (self.middle[:, j] <= high[j])
+        return inside
+
+    def slopes(self, noise: Array, rows: Bools | slice = slice(None)) -> Array:
+        """(n, nx), 0 where the change is no more than the arithmetic's noise."""
+        return np.asarray(np.where(self.change[rows] > noise, self.change[rows], 0.0) / self.length[rows, None])
+
+    def steepest(self, rows: Bools, noise: Array) -> Array:
+        """(nx, nz): the largest slope of each state along each axis among some of the pairs."""
+        slopes, axis = self.slopes(noise, rows), self.axis[rows]
+        parts = [slopes[axis == j].max(axis=0, initial=0.0) for j in range(self.ends.shape[2])]
+        return np.stack(parts, axis=1)
+
+    def count(self, rows: Bools, axes: Sequence[int]) -> int:
+        """How many of them that one of the axes has which has the fewest."""
+        return int(np.bincount(self.axis[rows], minlength=self.ends.shape[2])[list(axes)].min())

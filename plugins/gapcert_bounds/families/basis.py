@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Array, Domain, GapFunction, Interval, Undecided, UsageError
-from gapcert.plugin import GapFamily, GapProblem, Samples
+from gapcert.plugin import Array, Domain, GapFamily, GapFunction, GapProblem, Interval, Ints, Samples, Undecided, UsageError
 from gapcert_bounds.thresholds import THRESHOLDS
-from gapcert_functions import Expression, Term, WeightedSum, band, dominate, weighted
+from gapcert_functions import Expression, Factor, Term, WeightedSum, band, dominate, weighted
 
-from .terms import bounded
+from .grammar import MalformedError, Node, read
 
 Terms = Sequence[Term | Expression]
 
@@ -187,7 +186,7 @@ def scenario(terms: Terms, samples: Samples, domain: Domain, radius: float, seed
     return np.asarray(scaled * (units[:, None] / sizes))
 
 
-def _extremes(samples: Samples, i: int, seed: int) -> npt.NDArray[np.intp]:
+def _extremes(samples: Samples, i: int, seed: int) -> Ints:
     """The samples with the largest |r_i|, and a few hundred at random."""
     size = np.abs(samples.r[:, i])
     largest = np.argpartition(size, -min(100, len(size)))[-min(100, len(size)) :]
@@ -195,9 +194,9 @@ def _extremes(samples: Samples, i: int, seed: int) -> npt.NDArray[np.intp]:
     return np.union1d(largest, some)
 
 
-def _violated(terms: Terms, weights: Array, samples: Samples, units: Array) -> list[npt.NDArray[np.intp]]:
+def _violated(terms: Terms, weights: Array, samples: Samples, units: Array) -> list[Ints]:
     """Per state, the samples that are violated most: at most two of each chunk, so that they lie apart."""
-    rows: list[list[npt.NDArray[np.intp]]] = [[] for _ in units]
+    rows: list[list[Ints]] = [[] for _ in units]
     for c in _chunks(samples):
         missing = (np.abs(samples.r[c]) - weighted(terms, weights, samples.z[c])) / units
         for i in range(len(units)):
@@ -226,3 +225,72 @@ def _solve(matrix: Array, target: Array, cost: Array, slopes: Array | None = Non
             f"add the function '1'"
         )
     return np.asarray(v.value, dtype=np.float64)
+
+
+def parse(text: str, axes: Sequence[str]) -> Term | Expression:
+    """The function that `text` writes over named axes; UsageError where it is outside the grammar or names no axis."""
+    try:
+        node = read(text)
+    except MalformedError as error:
+        raise UsageError(f"gap.functions: '{text}': {error}") from None
+    tree = _tree(node, text, axes)
+    factors = [_factors(part, axes) for part in (node.parts if node.op == "*" else (node,))]
+    if any(f is None for f in factors):
+        return Expression(text.strip(), tree)
+    return Term(text.strip(), _merged([f for part in factors for f in part or ()]))
+
+
+def bounded(texts: Sequence[str], domain: Domain) -> list[Term | Expression]:
+    """The functions that texts write; UsageError where one, or its slope, is not bounded on the domain's box."""
+    terms = [parse(text, [a.name for a in domain.axes]) for text in texts]
+    for term in terms:
+        if not np.isfinite(term.error(domain.interval)):
+            raise UsageError(
+                f"gap.functions: '{term.text}' or a slope in it is unbounded on the domain's box, or not defined there "
+                f"(sqrt and log need positive arguments); change the function, or make the domain smaller"
+            )
+    return terms
+
+
+def _tree(node: Node, text: str, axes: Sequence[str]) -> Any:
+    if node.op == "number":
+        return node.number
+    if node.op == "axis":
+        if node.name not in axes:
+            near = difflib.get_close_matches(node.name, axes, 1)
+            hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(axes)}"
+            raise UsageError(f"gap.functions: '{text}': '{node.name}' is no state or input; {hint}")
+        return ["axis", list(axes).index(node.name)]
+    parts = [_tree(part, text, axes) for part in node.parts]
+    return [node.op, *parts, int(node.number)] if node.op == "^" else [node.op, *parts]
+
+
+def _factors(node: Node, axes: Sequence[str]) -> list[Factor] | None:
+    """axis^n, abs(axis)^n, sin(a axis)^n or cos(a axis)^n as factors, the number 1 as none; None for anything else."""
+    if node.op == "number":
+        return []
+    power, base = (int(node.number), node.parts[0]) if node.op == "^" else (1, node)
+    if base.op == "axis":
+        return [Factor(axes.index(base.name), "power", power)]
+    if base.op not in ("abs", "sin", "cos"):
+        return None
+    inner, scale = base.parts[0], 1.0
+    if base.op != "abs" and inner.op == "*" and [p.op for p in inner.parts] == ["number", "axis"]:
+        scale, inner = inner.parts[0].number, inner.parts[1]
+    if inner.op != "axis" or scale < 0:
+        return None
+    axis = axes.index(inner.name)
+    if base.op == "abs":
+        return [Factor(axis, "abs", power)]
+    return [Factor(axis, "sin" if base.op == "sin" else "cos", scale)] * power
+
+
+def _merged(factors: Sequence[Factor]) -> tuple[Factor, ...]:
+    """Powers of one axis as one power: x · x alone would range over negative numbers as well."""
+    powers: dict[tuple[int, str], float] = {}
+    waves = [f for f in factors if f.kind in ("sin", "cos")]
+    for f in factors:
+        if f.kind in ("power", "abs"):
+            powers[f.axis, f.kind] = powers.get((f.axis, f.kind), 0) + f.number
+    merged = [Factor(axis, "abs" if kind == "abs" else "power", n) for (axis, kind), n in powers.items()]
+    return (*merged, *waves)

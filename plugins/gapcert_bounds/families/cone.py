@@ -6,9 +6,8 @@ from collections.abc import Iterator
 from typing import final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Array
+from gapcert.plugin import Array, Ints
 from gapcert_bounds.thresholds import THRESHOLDS
 
 _BLOCK = 1 << 15  # entries of each working array: they stay in the second-level cache
@@ -42,7 +41,7 @@ class Cones:
         out[0][order], out[1][order] = lower.T, upper.T
         return out
 
-    def lowest(self, i: int, sign: int, z: Array) -> npt.NDArray[np.intp]:
+    def lowest(self, i: int, sign: int, z: Array) -> Ints:
         """(n,): the number of a cone of sign · g that is smallest at each point z (n, nz)."""
         (order, starts), own, every = self._groups(z), sign * self._g[i], np.arange(self._z.shape[1])
         points, out = np.ascontiguousarray(z[order].T), np.empty(len(z), dtype=np.intp)
@@ -80,14 +79,12 @@ class Cones:
         top[rows] = np.minimum(top[rows], parts.reshape(2, -1).max(axis=0))
         return top
 
-    def _means(
-        self, i: int, sign: int, centre: Array, h: Array, slope: Array
-    ) -> tuple[Array, Array, npt.NDArray[np.intp], Array]:
+    def _means(self, i: int, sign: int, centre: Array, h: Array, slope: Array) -> tuple[Array, Array, Ints, Array]:
         """`crest` without cuts, and what is reached; the axis along which alone cones of a mean of several bend, else −1, and
         the place.
         """
 
-        def ends(rows: npt.NDArray[np.intp], k: npt.NDArray[np.intp]) -> tuple[Array, Array]:
+        def ends(rows: Ints, k: Ints) -> tuple[Array, Array]:
             # g, and per axis what the cone with its slope is at the lower and the upper end of the box.
             away = centre[rows] - self._z[:, k].T
             sides = [np.abs(away + s * h[rows]) * self._lipschitz[i] + s * slope[rows] * h[rows] for s in (-1, 1)]
@@ -95,7 +92,7 @@ class Cones:
 
         depth, place = np.zeros(centre.shape), np.zeros(centre.shape)
 
-        def bend(rows: npt.NDArray[np.intp], k: npt.NDArray[np.intp]) -> None:
+        def bend(rows: Ints, k: Ints) -> None:
             deep = (h[rows] - np.abs(centre[rows] - self._z[:, k].T)) * self._lipschitz[i]
             place[rows] = np.where(deep > depth[rows], self._z[:, k].T, place[rows])
             depth[rows] = np.maximum(depth[rows], deep)
@@ -175,7 +172,7 @@ class Cones:
             total[...] = 0.0
         return total
 
-    def _groups(self, z: Array) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    def _groups(self, z: Array) -> tuple[Ints, Ints]:
         """An order of the points in which near ones are neighbours, and where each group of them starts (with the end).
 
         Of few points no groups are made, as nothing would be won.
@@ -198,9 +195,7 @@ class Cones:
         starts = np.flatnonzero(np.diff(cell[order], prepend=cell[order[0]] + 1)) if len(z) else np.zeros(0, dtype=np.intp)
         return order, np.append(starts, len(z))
 
-    def _candidates(
-        self, i: int, points: Array, starts: npt.NDArray[np.intp]
-    ) -> Iterator[tuple[int, int, npt.NDArray[np.intp] | slice]]:
+    def _candidates(self, i: int, points: Array, starts: Ints) -> Iterator[tuple[int, int, Ints | slice]]:
         """Per group: its start and end, and the cones that can be extreme at one of its points; without groups, all of them.
 
         Over a group with centre c and half-widths h no cone moves by more than ρ = Σ_j L_j h_j, so one that lies 2 ρ above the

@@ -7,12 +7,11 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert import Array, GapFunction, Interval
-from gapcert.plugin import GapFamily, GapProblem, Pulse, supremum
-from gapcert_bounds.constants.lipschitz import named
+from gapcert.plugin import Array, GapFamily, GapFunction, GapProblem, Interval, Pulse, supremum
+from gapcert_bounds.constants.declared import named
 
 from .envelope import Envelope
-from .multilinear_predictor import made
+from .multilinear import made
 
 
 @final

@@ -9,19 +9,16 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, final
 
 import numpy as np
-import numpy.typing as npt
 
-from gapcert import Array, Domain, GapFunction, Interval, UsageError
-from gapcert.plugin import Cells, GapFamily, GapProblem, Predictor
+from gapcert.plugin import Array, Cells, Domain, GapFamily, GapFunction, GapProblem, Interval, Ints, Predictor, UsageError
 
 from .cone import Cones
-from .multilinear_predictor import made
+from .multilinear import made
 
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = float(np.finfo(np.float64).tiny)
 _BLOCK = 1 << 18  # cones that are looked at together
 
-Index = npt.NDArray[np.intp]
 Ends = Callable[["EnvelopeGap", Interval], tuple[Interval, Interval]]
 
 
@@ -219,10 +216,10 @@ class PiecewiseEnvelope(GapFunction):
     def form(self) -> Mapping[str, Any]:
         return {"form": "envelope", "predictor": self.predictor.kind, "cells": len(self.cells)}
 
-    def _rounding(self, p: Array, m: Array, cell: Index) -> Array:
+    def _rounding(self, p: Array, m: Array, cell: Ints) -> Array:
         return rounding(p, m, np.abs(self.g).max(axis=0), self._slack[cell], self.z.shape[1])
 
-    def _cones(self, z: Array, cell: Index) -> tuple[Array, Array]:
+    def _cones(self, z: Array, cell: Ints) -> tuple[Array, Array]:
         """(lower, upper), each (n, nx): the extremes of g_k ∓ Σ_j L_cij |z_j − z_kj| over the samples of each point's cell."""
         nx = self.g.shape[1]
         lower, upper = np.full((len(z), nx), -np.inf), np.full((len(z), nx), np.inf)
@@ -235,7 +232,7 @@ class PiecewiseEnvelope(GapFunction):
             a = b
         return lower, upper
 
-    def _extremes(self, z: Array, cell: Index, rows: Index, lower: Array, upper: Array) -> None:
+    def _extremes(self, z: Array, cell: Ints, rows: Ints, lower: Array, upper: Array) -> None:
         c = cell[rows]
         counts = self._counts[c]
         first = np.cumsum(counts) - counts

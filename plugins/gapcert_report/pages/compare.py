@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from gapcert_figures import Figures
 from gapcert_report.pictures import compare as pictures
 from gapcert_report.pictures.svg import Picture
 from gapcert_report.words.compare import apart, groups, made, setting_name, share
-from gapcert_report.words.words import number
+from gapcert_report.words.words import Summary, number
 
 from .html import Html, h, section, table
 
-Summary = Mapping[str, Any]
 OPEN = 3
 """Pairs whose pictures are seen at once; those of the others are folded."""
 

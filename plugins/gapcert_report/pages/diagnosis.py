@@ -28,11 +28,9 @@ from gapcert_report.words.diagnosis import (
     won_of,
     won_sentence,
 )
-from gapcert_report.words.words import number
+from gapcert_report.words.words import Summary, number
 
 from .html import Html, folded, gallery, h, join, listing, part, said, table
-
-Summary = Mapping[str, Any]
 
 
 def tiles(summary: Summary) -> list[tuple[str, str, str, str]]:

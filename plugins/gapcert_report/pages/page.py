@@ -1,4 +1,4 @@
-"""The sections of a report, the answer first."""
+"""A run folder as one self-contained page: the answer first, then what it rests on."""
 
 from __future__ import annotations
 
@@ -10,19 +10,18 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from gapcert.plugin import DAMAGE, times
+from gapcert.plugin import DAMAGE, UsageError, __version__, clipped, times, write_atomic
 from gapcert_closed_loop import broken_sentence
 from gapcert_figures import Figures
 from gapcert_report.pictures.album import Album, album_of
 from gapcert_report.words import words
 from gapcert_report.words.compare import sentences
 from gapcert_report.words.diagnosis import cause_name, sentence, whole
-from gapcert_report.words.words import number
+from gapcert_report.words.words import Summary, number
 
 from . import compare, diagnosis
 from .html import Html, document, folded, framed, gallery, h, join, listing, part, said, section, table
 
-Summary = Mapping[str, Any]
 _STATE_COLUMNS = {
     "gap_mean": "mean gap",
     "gamma_mean": "mean γ",
@@ -400,3 +399,21 @@ def page(summary: Summary, figures: Figures, folder: Path, version: str) -> Html
     ]  # fmt: skip
     inside, main = contents(join(parts))
     return document(title, *framed([h("h1", name), inside, neighbours(folder)], [main], version))
+
+
+def write_report(folder: Path) -> Path:
+    """Write `report.html` from `summary.json` and the figures of a run folder; no other file, no network."""
+    source = folder / "summary.json"
+    if not source.is_file():
+        raise UsageError(f"{folder}: there is no summary.json; expected the folder of a finished run; run the spec again")
+    try:
+        summary = json.loads(source.read_text(encoding="utf-8"))
+        if not isinstance(summary, dict):
+            raise TypeError("it holds no object")
+        text = page(summary, Figures.load(folder), folder.resolve(), __version__)
+    except DAMAGE as error:
+        what = f"{source}: cannot be read ({type(error).__name__} {clipped(str(error))[0]})"
+        raise UsageError(f"{what}; expected what `gapcert run` writes; run the spec again") from error
+    path = folder / "report.html"
+    write_atomic(path, text.encode())
+    return path

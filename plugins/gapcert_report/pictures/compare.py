@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gapcert_figures import CompareFigure, PairFigure, held
 from gapcert_report.words.compare import apart, made, setting_name, share
+from gapcert_report.words.words import Summary
 
 from .svg import FAINT, GOOD, WITH, WITHOUT, Picture, draw, heat, scaled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Summary = Mapping[str, Any]
 _NAME = 52  # characters of a change beside its bar
 _CELL, _SAME = "#17181a", "#cfe9d8"  # inside bitmaps, so readable on light and dark alike
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any, final
@@ -12,6 +11,7 @@ import numpy as np
 from gapcert.plugin import pretty
 from gapcert_figures import Channel, Correlation, Course, DiagnosisFigure, Law, Signal, Waterfall
 from gapcert_report.words.diagnosis import headline
+from gapcert_report.words.words import Summary
 
 from .svg import BAD, FAINT, INK, TRUTH, WITH, WITHOUT, Picture, draw, scaled
 
@@ -186,7 +186,7 @@ def signal_picture(i: int, s: Signal) -> Picture:
     return draw(f"signal{i}", f"The experiment: {s.name}", caption, on, 2.2, link="experiment")
 
 
-def gain_picture(summary: Mapping[str, Any]) -> Picture | None:
+def gain_picture(summary: Summary) -> Picture | None:
     """Held-out error before and after, per horizon and channel, with bootstrap intervals."""
     horizons = sorted((summary.get("gain") or {}).items(), key=lambda x: float(x[0]))
     rows = [(horizon, channel, g) for horizon, channels in horizons for channel, g in channels.items()]
@@ -224,7 +224,7 @@ class DiagnosisAlbum:
     experiment: tuple[Picture, ...] = ()
 
 
-def diagnosis_album(d: DiagnosisFigure | None, summary: Mapping[str, Any]) -> DiagnosisAlbum:
+def diagnosis_album(d: DiagnosisFigure | None, summary: Summary) -> DiagnosisAlbum:
     """The hero is what a colleague is shown first: measured against simulated, the first law, and the waterfall."""
     if d is None:
         return DiagnosisAlbum()
@@ -252,7 +252,7 @@ def diagnosis_album(d: DiagnosisFigure | None, summary: Mapping[str, Any]) -> Di
     )
 
 
-def _quoted(d: DiagnosisFigure, summary: Mapping[str, Any]) -> int:
+def _quoted(d: DiagnosisFigure, summary: Summary) -> int:
     """The channel that the answer quotes; where it quotes several as one, such as a position, of those in its unit, and where
     it quotes none, of all, the one whose simulation improved most, relative to its motion."""
     name = found[1] if (found := headline(summary)) is not None else ""

@@ -9,9 +9,7 @@ from gapcert.plugin import times
 from gapcert_figures import called
 
 from .diagnosis import cause_name, measured
-from .words import listed, markdown_table, number
-
-Summary = Mapping[str, Any]
+from .words import Summary, listed, markdown_table, number
 
 
 def apart(summary: Summary) -> list[Summary]:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from gapcert.plugin import pretty, share
 from gapcert_figures import KINDS, called, spoken
 
-from .words import listed, markdown_table, number, refutation
+from .words import Summary, listed, markdown_table, number, refutation
 
-Summary = Mapping[str, Any]
 SETTINGS = {
     "damping": "the drag on every link, linear and by the square, in 1/s",
     "dry_friction": "how dry friction is solved",

@@ -1,21 +1,30 @@
-"""A run's summary in words, as a terminal shows them."""
+"""A run's summary in words: as lines for a terminal, and as text for viewers that show markdown."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from gapcert.plugin import columns
 from gapcert_closed_loop import broken_sentence
 
-from . import compare as compare_words
-from .compare import setting_name
-from .diagnosis import numbers, refitted_named, shrunk, won_sentence
-from .words import hidden_sentence, learned_sentence, on_the_way
+from .compare import compare_markdown, sentences, setting_name
+from .diagnosis import diagnosis_markdown, numbers, refitted_named, shrunk, won_sentence
+from .words import (
+    Summary,
+    claim_sentence,
+    hidden_sentence,
+    learned_sentence,
+    loop_sentence,
+    markdown_table,
+    number,
+    on_the_way,
+    plain,
+)
 
 
-def in_words(summary: Mapping[str, Any]) -> Iterator[str]:
+def in_words(summary: Summary) -> Iterator[str]:
     """A run's JSON summary as lines for people."""
     for one in summary.get("runs", ()):
         yield from in_words(one)
@@ -44,10 +53,15 @@ def _number(value: Any) -> str:
     return "-" if value is None else str(value)
 
 
-def _certificate(certificate: Mapping[str, Any]) -> Iterator[str]:
+def _told_of(states: Summary) -> dict[str, str]:
+    """What a table tells of each state, with its title; of a γ that nothing was compared with, that alone."""
+    told = {"gap_mean": "mean gap", "gamma_mean": "mean γ", "tightness": "tightness", "constant_bound": "constant"}
+    return told if any("gap_mean" in s for s in states.values()) else {"gamma_max": "declared γ"}
+
+
+def _certificate(certificate: Summary) -> Iterator[str]:
     if states := certificate.get("states", {}):
-        told = {"gap_mean": "mean gap", "gamma_mean": "mean γ", "tightness": "tightness", "constant_bound": "constant"}
-        told = told if any("gap_mean" in s for s in states.values()) else {"gamma_max": "declared γ"}
+        told = _told_of(states)
         rows = [[name, *(_number(s.get(k)) for k in told)] for name, s in states.items()]
         yield from ("  " + line for line in columns(("state", *told.values()), rows))
         if empty := [name for name, s in states.items() if s.get("vacuous")]:
@@ -69,7 +83,7 @@ def _certificate(certificate: Mapping[str, Any]) -> Iterator[str]:
     yield from (f"  warning: {w}" for w in certificate.get("warnings", ()))
 
 
-def _controller(summary: Mapping[str, Any]) -> Iterator[str]:
+def _controller(summary: Summary) -> Iterator[str]:
     if controller := summary.get("controller"):
         share = f", {controller['winning_fraction']:.1%} of the volume" if controller.get("levels") else ""
         cells = f"{controller.get('winning_cells')} of {controller.get('cells')} cells win{share}"
@@ -97,10 +111,10 @@ def _controller(summary: Mapping[str, Any]) -> Iterator[str]:
     yield from (f"  {broken_sentence(r)}" for r in ours if r.get("broken_promises"))
 
 
-def _comparison(summary: Mapping[str, Any]) -> Iterator[str]:
+def _comparison(summary: Summary) -> Iterator[str]:
     if "pairs" not in summary:
         return
-    yield from (f"  {text}" for text in compare_words.sentences(summary))
+    yield from (f"  {text}" for text in sentences(summary))
     yield from (f"  {u['backend']} is unavailable: {u['reason']}" for u in summary["unavailable"])
     keys = ("backend", "family", "lipschitz", "seed", "tightness", "samples", "cpu_s", "claim", "violations")
     rows = [[_number(r[k]) if k != "samples" else r[k] or "-" for k in keys] + [r.get("refused", "")] for r in summary["rows"]]
@@ -117,7 +131,7 @@ def _comparison(summary: Mapping[str, Any]) -> Iterator[str]:
         yield from ("  " + line for line in columns(("a", "b", "mean", "max", "", "closed by"), pairs))
 
 
-def _diagnosis(summary: Mapping[str, Any]) -> Iterator[str]:
+def _diagnosis(summary: Summary) -> Iterator[str]:
     if "causes" not in summary:
         return
     if text := summary.get("sentence"):
@@ -140,3 +154,24 @@ def _diagnosis(summary: Mapping[str, Any]) -> Iterator[str]:
         yield f"  {text}"
     if path := summary.get("experiment_file"):
         yield f"  the input to play: {path}"
+
+
+def markdown(summary: Summary) -> str:
+    """The answer of a run as text, for viewers that show markdown: the verdict and its reason, then what they rest on."""
+    parts = [f"# {summary['name']}: {summary['verdict']}"] if "verdict" in summary else []
+    if summary.get("verdict") in ("fails", "unknown") and summary.get("reason"):
+        parts.append(f"**{plain(str(summary['reason'])).rstrip('.')}.**")
+    if "certificate" in summary:
+        c, states = summary["certificate"], summary["certificate"]["states"]
+        known = {k: title for k, title in _told_of(states).items() if any(s.get(k) is not None for s in states.values())}
+        named = {n: f"{n} (vacuous)" if s.get("vacuous") else n for n, s in states.items()}
+        rows = [(named[name], *(number(s.get(k), 3) for k in known)) for name, s in states.items()]
+        parts += [claim_sentence(c), loop_sentence(summary), markdown_table(("state", *known.values()), rows)]
+        parts += ["## Assumptions", "\n".join(f"{i}. {plain(a)}" for i, a in enumerate(c["assumptions"], 1)) or "None."]
+        if "samples" in c:
+            parts += [f"Transitions spent: {', '.join(f'{k} {v:,}' for k, v in c['samples'].items())}."]
+    if "pairs" in summary:
+        parts.append(compare_markdown(summary))
+    if "causes" in summary:
+        parts += diagnosis_markdown(summary)
+    return "\n\n".join(p for p in parts if p) + "\n"

@@ -8,6 +8,8 @@ from typing import Any
 
 from gapcert.plugin import outside, pretty, times
 
+Summary = Mapping[str, Any]
+"""What a run has found, as its summary.json holds it, or a part of that."""
 MARKS = {"good": "✓", "bad": "✗", "open": "?"}
 MANY = 3  # states of which each is named; of more there is a range
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -27,7 +29,7 @@ VERDICTS = {
 }
 
 
-def verdict(summary: Mapping[str, Any]) -> tuple[str, str, str]:
+def verdict(summary: Summary) -> tuple[str, str, str]:
     """Word, kind and meaning of the verdict: open where γ was declared or is vacuous, or where causes leave more than noise."""
     word, kind, meaning = VERDICTS[summary["verdict"]]
     certificate = summary.get("certificate", {})
@@ -64,12 +66,12 @@ def number(value: Any, digits: int = 4) -> str:
     return power(int(exponent)) if mantissa == "1" else f"{mantissa}\u00a0×\u00a0{power(int(exponent))}"
 
 
-def _fresh(certificate: Mapping[str, Any]) -> str:
+def _fresh(certificate: Summary) -> str:
     points = certificate.get("audit", {}).get("points", 0)
     return f"{points:,} fresh points" if points else "the points that were looked at"
 
 
-def refutation(certificate: Mapping[str, Any]) -> str | None:
+def refutation(certificate: Summary) -> str | None:
     """What refutes a certificate, or None."""
     audit = certificate.get("audit", {})
     if (found := audit.get("violations", 0)) > audit.get("allowed", 0):
@@ -85,7 +87,7 @@ def refutation(certificate: Mapping[str, Any]) -> str | None:
     return None
 
 
-def jump_sentence(certificate: Mapping[str, Any]) -> str | None:
+def jump_sentence(certificate: Summary) -> str | None:
     """In how much of the domain f̂ − f jumps, and where most; None where nothing does."""
     lipschitz = certificate.get("lipschitz", {})
     if not lipschitz.get("marked"):
@@ -100,7 +102,7 @@ def jump_sentence(certificate: Mapping[str, Any]) -> str | None:
     )
 
 
-def witness_sentence(certificate: Mapping[str, Any]) -> str | None:
+def witness_sentence(certificate: Summary) -> str | None:
     """Where fresh points left the band by most."""
     w = certificate.get("audit", {}).get("witness", {})
     if "at" not in w:
@@ -110,7 +112,7 @@ def witness_sentence(certificate: Mapping[str, Any]) -> str | None:
     return f"Worst at {at}: there f̂ − f of {state} is {number(w['residual'])}, {outside(w)}."
 
 
-def claim_sentence(certificate: Mapping[str, Any]) -> str:
+def claim_sentence(certificate: Summary) -> str:
     """What the claim says of |f̂ − f|, at its level, and nothing beyond it."""
     if (refuted := refutation(certificate)) is not None:
         return refuted
@@ -138,7 +140,7 @@ def claim_sentence(certificate: Mapping[str, Any]) -> str:
     return f"At {fresh}, |f̂ − f| ≤ γ without a violation. This is evidence, not a proof: nothing is claimed elsewhere."
 
 
-def _further(claim: Mapping[str, Any], made: Mapping[str, Any]) -> str:
+def _further(claim: Summary, made: Summary) -> str:
     """The claim of a recording: about a further window, of which it assumes something."""
     epsilon, beta, held = number(claim["epsilon"]), claim.get("beta"), made["windows"]["calibration"]
     level, alike = "On average over calibrations", "exchangeable"
@@ -150,7 +152,7 @@ def _further(claim: Mapping[str, Any], made: Mapping[str, Any]) -> str:
     )
 
 
-def symbols(certificate: Mapping[str, Any]) -> str:
+def symbols(certificate: Summary) -> str:
     """What f, f̂ or x⁺, γ and [l, u] are."""
     if "recording" in certificate:
         return (
@@ -164,12 +166,12 @@ def symbols(certificate: Mapping[str, Any]) -> str:
     )
 
 
-def tightness(certificate: Mapping[str, Any]) -> dict[str, float]:
+def tightness(certificate: Summary) -> dict[str, float]:
     """Mean γ over mean gap, of the states that have one."""
     return {n: s["tightness"] for n, s in certificate.get("states", {}).items() if s.get("tightness") is not None}
 
 
-def tightness_sentence(certificate: Mapping[str, Any]) -> str:
+def tightness_sentence(certificate: Summary) -> str:
     """How much larger γ is than the gap it bounds, over the audit's points."""
     tight = tightness(certificate)
     parts = [f"{t:.3f} × the mean gap of {name}" for name, t in tight.items()]
@@ -202,18 +204,18 @@ HIDDEN = {
 """What became of hidden state that matters, by mode."""
 
 
-def hidden_sentence(hidden: Mapping[str, Any]) -> str:
+def hidden_sentence(hidden: Summary) -> str:
     """What is done about engine state that the model leaves out."""
     what = HIDDEN["refuse" if hidden.get("harmless") else hidden["mode"]]
     return f"The simulator's state has parts that the model's has not: {listed(hidden['names'])}. {what}"
 
 
-def on_the_way(row: Mapping[str, Any]) -> int:
+def on_the_way(row: Summary) -> int:
     """How many runs neither broke nor reached the target within their steps; only a reach-avoid goal has any."""
     return int(row["starts"] - row["violations"] - row["reached"]) if "reached" in row else 0
 
 
-def suprema(told: Mapping[str, Any]) -> str:
+def suprema(told: Summary) -> str:
     """Over which blocks of cells and inputs γ was bounded, and over which coordinates its supremum was taken."""
     blocks = " × ".join(f"{n} of {name}" for name, n in told["blocks"].items())
     taken = [
@@ -224,7 +226,7 @@ def suprema(told: Mapping[str, Any]) -> str:
     return f"γ was bounded over blocks, {blocks}.{''.join(taken)}"
 
 
-def runs_sentence(loop: Mapping[str, Any]) -> str:
+def runs_sentence(loop: Summary) -> str:
     """What the runs with γ earn as an audit of independent starts."""
     if not (c := loop.get("claim")):
         return ""
@@ -236,7 +238,7 @@ def runs_sentence(loop: Mapping[str, Any]) -> str:
     )
 
 
-def learned_sentence(loop: Mapping[str, Any]) -> str:
+def learned_sentence(loop: Summary) -> str:
     """What the runs with γ learned of parameters, and whether γ or a range was found to be wrong."""
     parts, refuted = [], 0
     for name, told in loop.get("learned", {}).items():
@@ -255,7 +257,7 @@ def between(low: float, high: float) -> str:
     return f"{first} to {last}" if first != last else f"{first} ± {number((high - low) / 2, 2)}"
 
 
-def loop_sentence(summary: Mapping[str, Any]) -> str:
+def loop_sentence(summary: Summary) -> str:
     """What was seen in closed loop; runs that were seen, unless the controller's claim says more."""
     loop = summary.get("closed_loop")
     if not loop:
