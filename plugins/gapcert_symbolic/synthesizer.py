@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Literal, NamedTuple, final
 
@@ -21,8 +21,7 @@ from .cells.bounds import Bound, Enclosed, Grown, inferred
 from .cells.gaps import Disturbance, disturbance
 from .cells.grid import Grid, combined, multiples, spaced
 from .cells.held import Left, invariant, offered
-from .games.automata import Labels, product, started
-from .games.games import reach_and_stay, recurrence, solve, usable
+from .games.games import Labels, solve_goal, started, usable
 from .games.reason import in_words, tried, why_empty
 from .games.refinement import Refined, refined
 from .solvers.problem import Dynamics, Problem, Solution
@@ -204,7 +203,7 @@ class Symbolic(Synthesizer):
         # What a solver without tables is given it may take for its own.
         own = safe() if dynamics is None else _safe(grid, goal)
         asked = Problem(paths, own, None, dynamics, self.solver, usable(self.threads, grid.size * inputs))
-        solution = _solve(goal, asked, target, labels)
+        solution = solve_goal(goal, asked, target, labels)
         Pulse(problem.emit, "controller", 1, part="fixpoint")(1, solution.told)
         return _Made(goal, grid, inputs, paths, safe, target, labels, solution, paths.cache_info().currsize > 0)
 
@@ -292,19 +291,6 @@ class _Plan(NamedTuple):
 def _safe(grid: Grid, goal: Goal) -> Bools:
     safe = ~grid.touching(goal.avoid)
     return safe if grid.nodes is None else safe & grid.inside(Region((goal.stay,)))
-
-
-def _solve(goal: Goal, problem: Problem, target: Bools, labels: Labels | None) -> Solution:
-    if goal.automaton is not None and labels is not None:
-        by: Any = None
-        if problem.solver == "jax":
-            from .solvers import dense
-
-            by = dense.Positions
-        return product(problem.windows(), problem.safe, goal.automaton, labels, by)
-    if goal.kind in ("invariance", "reach_avoid"):
-        return solve(problem if goal.kind == "invariance" else replace(problem, target=target))
-    return {"reach_and_stay": reach_and_stay, "recurrence": recurrence}[goal.kind](problem, target)
 
 
 def _grid(goal: Goal, on: tuple[int, ...], held: Box | None, counts: tuple[int, ...]) -> Grid:

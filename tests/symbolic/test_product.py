@@ -22,7 +22,7 @@ from gapcert_closed_loop.closed_loop import compare_loops
 from gapcert_symbolic.cells.abstraction import windows
 from gapcert_symbolic.cells.bounds import Enclosed
 from gapcert_symbolic.cells.grid import Grid, combined
-from gapcert_symbolic.games.automata import Labels, product
+from gapcert_symbolic.games.games import Labels, product
 from gapcert_symbolic.synthesizer import Symbolic
 
 SIDE = 11

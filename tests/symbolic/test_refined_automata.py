@@ -24,7 +24,7 @@ from gapcert_cells.export.export import export
 from gapcert_cells.testing import Band
 from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.games import refinement
-from gapcert_symbolic.games.automata import Labels, leads_of, product, started
+from gapcert_symbolic.games.games import Labels, leads_of, product, started
 from gapcert_symbolic.games.refinement import Refined, refined
 from gapcert_symbolic.solvers.problem import Solution
 from gapcert_symbolic.synthesizer import Symbolic

@@ -17,8 +17,7 @@ from gapcert_cells.testing import Band, rod_problem, rod_reach_avoid
 from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.games import games
-from gapcert_symbolic.games.automata import Labels, product
-from gapcert_symbolic.games.games import solve
+from gapcert_symbolic.games.games import Labels, product, solve
 from gapcert_symbolic.solvers.problem import Play, Problem, Solution
 from gapcert_symbolic.synthesizer import Symbolic
 

@@ -14,7 +14,7 @@ from gapcert.plugin import Automaton, Bools
 from gapcert_cells import Along
 from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.grid import Grid
-from gapcert_symbolic.games import automata, games
+from gapcert_symbolic.games import games
 from gapcert_symbolic.kernels import reach, repeats
 from gapcert_symbolic.solvers.problem import Play
 
@@ -109,10 +109,10 @@ def test_both_ways_agree_on_positions(n: int, m: int, seed: int, relations: bool
         after[-1], accepting[-1] = states - 1, True
     automaton = Automaton(("a", "b"), tuple(map(tuple, after.tolist())), tuple(accepting.tolist()))
     must = rng.choice(4, size, p=[0.7, 0.1, 0.1, 0.1])
-    labels = automata.Labels(must, must | rng.choice(4, size, p=[0.8, 0.1, 0.05, 0.05]))
+    labels = games.Labels(must, must | rng.choice(4, size, p=[0.8, 0.1, 0.05, 0.05]))
     safe, found = rng.random(size) < 0.97, []
-    play = Play(windows, safe, automaton, *automata.leads_of(automaton, labels))
-    for game in (automata.Watched(play) for _ in range(2)):
+    play = Play(windows, safe, automaton, *games.leads_of(automaton, labels))
+    for game in (games.Watched(play) for _ in range(2)):
         assert game.repeats is not None
         if found:
             game.repeats = None

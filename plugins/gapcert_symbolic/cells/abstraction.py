@@ -137,8 +137,7 @@ def windows(
     Each axis has a table over the axes on which its window depends, which the Jacobian over all cells and inputs tells, and
     the blocks of the gap. f is asked only where its own axes differ.
     """
-    model = bound.model
-    own = structure(bound, grid, axes)
+    own, model = structure(bound, grid, axes), bound.model
     names = [*(model.states[j].name for j in grid.states), *(s.name for s in model.inputs)]
     made = fitted(added, own, grid, axes, grid.size if cell is None else len(cell), names)
     alike: dict[tuple[Any, ...], list[int]] = {}

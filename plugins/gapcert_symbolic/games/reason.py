@@ -18,7 +18,7 @@ from gapcert_symbolic.cells.gaps import Disturbance
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.thresholds import THRESHOLDS
 
-from .automata import Labels
+from .games import Labels
 
 
 @final

@@ -32,7 +32,7 @@ from gapcert_symbolic.kernels.kernels import Game
 from gapcert_symbolic.solvers.problem import Solution, entered
 from gapcert_symbolic.thresholds import THRESHOLDS
 
-from .automata import Labels, leads_of, missed, started
+from .games import Labels, leads_of, missed, started
 
 
 @final

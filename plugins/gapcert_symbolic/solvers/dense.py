@@ -53,7 +53,7 @@ def _reach_avoid(windows: Windows, safe: Bools, target: Bools) -> Solution:
 
 
 class Positions:
-    """As `automata.Watched`: in every round the cells of each state of the automaton that can be entered in more cells now."""
+    """As `games.Watched`: in every round the cells of each state of the automaton that can be entered in more cells now."""
 
     def __init__(self, play: Play) -> None:
         self.play, self.game = play, _Game(play.windows)
