@@ -184,7 +184,7 @@ def test_nothing_is_imported_through_the_folder_core():
 def test_nothing_is_left_open_and_no_path_is_absolute():
     wrong = re.compile(r"\b(TODO|FIXME|XXX|NotImplementedError)\b|[\"'](/home|/root|/work)/")
     assert [(name(p), found[0]) for p in SOURCES for found in wrong.finditer(p.read_text())] == []
-    assert len(SOURCES) > 500
+    assert len(SOURCES) > 400
 
 
 # --- the public API

@@ -173,6 +173,12 @@ def knots(edges: Iterable[tuple[str, str]]) -> list[list[str]]:
     return sorted(found)
 
 
+def totals() -> dict[str, int]:
+    """Lines of the core, and of core and plugins together."""
+    core, plugins = (sum(len(p.read_text().splitlines()) for p in (ROOT / top).rglob("*.py")) for top in ("core", "plugins"))
+    return {"core": core, "together": core + plugins}
+
+
 def main() -> None:
     modules = files()
     found = imports(modules)
@@ -180,8 +186,7 @@ def main() -> None:
     for name in ORDER:
         own = [path for module, path in modules.items() if room(module) == name]
         print(f"{name:24}{len(own):6}{sum(len(p.read_text().splitlines()) for p in own):8}")
-    total = {top: sum(len(p.read_text().splitlines()) for p in (ROOT / top).rglob("*.py")) for top in ("core", "plugins")}
-    print(f"core {total['core']}, plugins {total['plugins']}, together {sum(total.values())} lines")
+    print(", ".join(f"{what} {n}" for what, n in totals().items()), "lines")
     print(f"most files in one folder: {max(folders().values())}")
     pairs = {(i.source, i.target) for i in upward(found)}
     print(f"{len(pairs)} pairs of files import upwards")
