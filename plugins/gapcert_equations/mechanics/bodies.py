@@ -139,9 +139,9 @@ def _poses(bodies: Sequence[_Body], q: Sequence[Any]) -> tuple[list[Matrix], lis
 def _rotation(a: Vector, angle: Any) -> Matrix:
     """By Rodrigues: 1 + sin K + (1 − cos) K²."""
     s, c, outer = angle.sin(), angle.cos(), np.outer(a, a)
+    cross = _array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
     # cos (δ − aᵢaⱼ) + aᵢaⱼ + sin Kᵢⱼ: one cosine where the axis is a frame's own.
-    turn: Matrix = (np.eye(3) - outer) * c + outer + _array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]]) * s
-    return turn
+    return np.asarray((np.eye(3) - outer) * c + outer + cross * s)
 
 
 def _mass(bodies: Sequence[_Body], turns: list[Matrix], places: list[Vector]) -> list[list[Any]]:
@@ -241,8 +241,7 @@ def _length(a: Vector) -> Any:
 
 def _spread(a: Vector, b: Vector) -> Matrix:
     """(a·b) 1 − b aᵀ: what a mass at a distance adds to an inertia."""
-    spread: Matrix = np.eye(3) * (a @ b) - np.outer(b, a)
-    return spread
+    return np.asarray(np.eye(3) * (a @ b) - np.outer(b, a))
 
 
 def _cross(a: Vector, b: Vector) -> Vector:
