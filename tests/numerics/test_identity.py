@@ -22,7 +22,7 @@ GONE = {
     "gapcert_symbolic.abstraction:Axis": "what a step may touch along an axis is gapcert_cells:Along, whether promised or not",
     "gapcert_symbolic.solvers:Compiled": "which solver answers a problem is for the order of SOLVERS to say",
     "gapcert_symbolic.solvers:Fixpoints": "as above",
-    "gapcert_equations.build:OutputDelays": "delays of outputs are Delays, as those of forces",
+    "gapcert_equations.build:OutputDelays": "delays of outputs are Delays, as those of inputs are",
     "gapcert_gymnasium.adapters:Own": "an environment of the user's is an Attribute like the known ones",
     "gapcert.diagnosis.asked:Answer": "what a study found is an Outcome, whatever the study",
     "gapcert.events:Stages": "a protocol that only gapcert.run:_Stages had",
