@@ -8,6 +8,7 @@ import pytest
 import gapcert as gc
 from gapcert.contracts.systems.system import step_seed
 from gapcert.numerics.counter_rng import keys, normals, uniforms
+from gapcert.spec.schema import schema
 from gapcert.testing import SystemContract
 from gapcert.testing.systems import ToyOscillator
 from gapcert.testing.toys import Drift
@@ -187,7 +188,7 @@ def test_faults_inside_are_told_at_their_place(tmp_path, text, place, message):
 
 
 def test_the_schema_knows_the_backend_inside():
-    definitions = gc.load_spec.__globals__["schema"]()["$defs"]
+    definitions = schema()["$defs"]
     assert definitions["backend.stochastic"]["properties"]["of"]["$ref"] == "#/else/properties/backend"
 
 
