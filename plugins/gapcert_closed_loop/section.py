@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal, final, get_args
+from typing import Literal, final
 
 from pydantic import Field
 
-from gapcert.plugin import Count, Probability, Section, SpecSection, Whole
-
-Policy = Literal["first", "middle", "last", "random", "least-effort", "adversarial"]
+from gapcert.plugin import POLICIES, Count, Policy, Probability, Section, SpecSection, Whole
 
 
 @final
@@ -22,9 +20,7 @@ class ClosedLoopConfig(Section):
     steps: Count = Field(600, description="of each run, in periods")
     starts: Count = Field(100, description="runs per policy, at most")
     confidence: Probability = Field(0.999, description="1 − β of what the runs with γ show")
-    policies: list[Policy] = Field(
-        default=list(get_args(Policy)), min_length=1, description="which valid inputs are applied, in turn"
-    )
+    policies: list[Policy] = Field(list(POLICIES), min_length=1, description="which valid inputs are applied, in turn")
     starts_from: Literal["both", "without_gamma"] = Field(
         "both", description="where both controllers win, or where the one without γ does"
     )
