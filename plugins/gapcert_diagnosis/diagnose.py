@@ -242,7 +242,7 @@ def _effects(effects: Sequence[Effect | str] | Literal["all"]) -> list[Effect]:
 
 
 def _timed(model: Model, recording: Recording, horizons: Sequence[float]) -> None:
-    """Refuses rows in no order, and what is shorter than a sample: as a rule times in another unit than they are read in."""
+    """Refuses rows in no order, no horizon, and one below a sample: as a rule times in another unit than they are read in."""
     ordered(recording)
     if not horizons:
         raise UsageError("diagnose: no horizon is given; name at least one in seconds, such as [0.5]")

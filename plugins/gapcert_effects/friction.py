@@ -179,7 +179,7 @@ _DISPLACEMENT = EffectParameter("displacement", {"position_range": 1}, (0.003, 0
 
 
 def _bristle(curve: str) -> str:
-    """The bend after a sub-step of ṡ = (v/d)·(1 − s·sgn(v)/γ), in shares of the bend at which it slides."""
+    """The bend after a sub-step of ṡ = (v/d)·(1 − s·sgn(v)/γ), exact at constant v, in shares of that at which it slides."""
     end = f"{curve}*sign({{v}})"
     return f"{end} + ({{memory}} - {end})*exp(-abs({{v}})*{{h}}/({{displacement}}*{curve}))"
 

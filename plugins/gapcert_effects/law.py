@@ -89,7 +89,7 @@ def tilts(site: str, model: gc.Model) -> bool:
 
 
 def _weighs(site: str, model: gc.Model) -> bool:
-    """Does a resting coordinate of a _mechanical model feel a force that depends on its place?"""
+    """Does a resting coordinate of a mechanical model feel a force that depends on its place?"""
     if not _section(model, "bodies") and not any(site in _words(str(t)) for t in _section(model, "bias").values()):
         return False
     n = len(model.coordinates)

@@ -90,7 +90,7 @@ class SensorQuantisation(Law):
 
 
 def _lattice(values: Array) -> float | None:
-    """The step δ of values near multiples of δ (and an offset), or None.
+    """The step δ of values near multiples of δ (and an offset), or None; read off their distribution alone.
 
     |mean exp(2πi y/δ)| is 1 on a lattice, exp(−2π²σ²/δ²) under noise σ that is added to it, and about 1/√cells else.
     """
