@@ -89,10 +89,12 @@ class SpecChecker:
         readers: dict[str, Callable[[str, Any], Any]] = {
             **dict.fromkeys(PLAIN, lambda name, section: validate(PLAIN[name], section, (name,), self.problems)),
             **dict.fromkeys((k for k in COMPONENTS if "." not in k), lambda name, section: self.component((name,), section)),
-            **dict.fromkeys(_Values.model_fields, self.value),
+            "domain": self.value,
             "sampling": self.sampling,
             "lipschitz": self.lipschitz,
             "expect": self.expect,
+            "relations": self.value,
+            "coordinates": self.value,
             "hidden": self.hidden,
             **{name: lambda key, section: self.contributed[key].read(self, section) for name in self.contributed},
         }

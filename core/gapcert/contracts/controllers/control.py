@@ -1,4 +1,4 @@
-"""What a controller is, who makes one, and what it says of each step."""
+"""What a controller is, who makes one, which of the inputs that it allows is applied, and what it says of each step."""
 
 from __future__ import annotations
 
