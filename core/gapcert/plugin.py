@@ -8,8 +8,6 @@ from gapcert.lazy import LazyPackage, homes
 
 _HOME = homes(
     {
-        "gapcert.certification.refutation": "Trails follow",
-        "gapcert.certification.supremum": "supremum",
         "gapcert.certification.certificate": (
             "Audit Certificate Ledger Record StateEvidence domain_data figures gap_digest saved_digest"
         ),
@@ -20,9 +18,11 @@ _HOME = homes(
         "gapcert.certification.gates.augment": "forgets widen",
         "gapcert.certification.gates.hidden_distribution": "Law beginning",
         "gapcert.certification.gates.hidden_state": "Gate",
+        "gapcert.certification.refutation": "Trails follow",
         "gapcert.certification.routes": "Findings Request Route",
         "gapcert.certification.samples.executors": "processes",
         "gapcert.certification.samples.store": "Store",
+        "gapcert.certification.supremum": "supremum",
         "gapcert.contracts.controllers.control": "Controller SynthesisProblem Synthesizer",
         "gapcert.contracts.controllers.policies": "ANYWHERE POLICIES Policy known",
         "gapcert.contracts.controllers.goal": "MOST Automaton Goal",
@@ -36,7 +36,7 @@ _HOME = homes(
         "gapcert.contracts.plugins.events": "BEAT Emit Event Pulse Stages silent",
         "gapcert.contracts.plugins.options": "ConfigContract Keyed of_config",
         "gapcert.contracts.plugins.presentation": "Shown View view",
-        "gapcert.contracts.plugins.component": ("ALLOW_CODE EXECUTED LOG RUN Answer Argument Arguments Component Context load"),
+        "gapcert.contracts.plugins.component": "ALLOW_CODE EXECUTED LOG RUN Answer Argument Arguments Component Context load",
         "gapcert.contracts.plugins.registry": "Registry hookimpl registry",
         "gapcert.contracts.systems.cells": "Cells",
         "gapcert.contracts.systems.domain": "Box Cover Domain Points",
@@ -53,8 +53,8 @@ _HOME = homes(
         "gapcert.numerics.atomic_files": "DAMAGE damage_told npz_bytes write_atomic",
         "gapcert.numerics.constraint_zone": "Relation Zone grid_at grid_size lattice",
         "gapcert.numerics.counter_rng": "keys normals uniforms",
-        "gapcert.numerics.errors": "GapcertError MissingDependency NoStart SpecError Undecided UsageError clipped harmless",
         "gapcert.numerics.digest": "identity json_digest located",
+        "gapcert.numerics.errors": "GapcertError MissingDependency NoStart SpecError Undecided UsageError clipped harmless",
         "gapcert.numerics.interpolation": "cells cut highest interpolate joined on_curvature ranges rounding slopes worst",
         "gapcert.numerics.intervals": "Interval",
         "gapcert.numerics.kernels": "compiler",

@@ -259,7 +259,9 @@ def _figure(model: Model, laboratory: Laboratory, measured: Sequence[Pair]) -> C
 
 
 def write_tables(summary: Mapping[str, Any], folder: Path) -> None:
-    """One line per row of the matrix, per pair, and per setting that was named; a pair also has its states and worst point."""
+    """For spreadsheets rows.csv, pairs.csv and settings.csv: a line per row of the matrix, per pair, and per setting that was
+    named; a pair also has its states and worst point.
+    """
     rows = [{**{k: r[k] for k in ROW}, **_states(r, ("tightness", "resolved")), **_said(r)} for r in summary["rows"]]
     rows += [{**dict.fromkeys(ROW), "backend": u["backend"], "unavailable": u["reason"]} for u in summary["unavailable"]]
     pairs = []

@@ -1,4 +1,7 @@
-"""Logs as they come, onto an even grid: clocks that jump, samples that are lost, late or absurd. Everything done is counted."""
+"""Logs as they come, onto an even grid: clocks that jump, angles that wrap, samples that are lost, late or absurd.
+
+Everything done is counted, and told.
+"""
 
 from __future__ import annotations
 

@@ -221,7 +221,7 @@ class Record(ABC):
 
 
 class Statement(Shown, ABC):
-    """γ as something is said of it, by a certificate or by a person: asked, held against measurements, and saved."""
+    """What a certificate or a person says of γ: it is asked, held against measurements, and saved."""
 
     gap: GapFunction
     versions: Mapping[str, str]

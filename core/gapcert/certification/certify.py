@@ -92,7 +92,7 @@ def certify(
     asked = Question(model, domain, sampling, lipschitz, family, p, by, fit, request, symmetries, seed, question)
 
     plan = replace(hidden or HiddenPlan(), ignore=(*(hidden or HiddenPlan()).ignore, *symmetries))
-    gate = entry.enter(model, backend, domain, plan, request.claim, executor, seed, emit)  # f̂ is a function of (x, u)
+    gate = entry.enter(model, backend, domain, plan, request.claim, executor, seed, emit)  # r = f̂ − f is a function of (x, u)
     with Kept(executor) as pools:
         key = digest(model, gate.system, domain)
         store = Store(Path(folder) / "samples", Residual(gate.system, model), key, pools, sampling.chunk, emit)

@@ -41,13 +41,6 @@ PLAIN: dict[str, type[BaseModel]] = {
 }
 SAMPLING: dict[str, type[BaseModel]] = {"grid": s.GridSampling, "adaptive": s.AdaptiveSampling, "lattice": s.LatticeSampling}
 BOUNDED = ("residual", "network", "expression")
-# Section: what it has to be, that in words, and how it is written.
-SHAPES: dict[str, tuple[type, str, str]] = {
-    "lipschitz": (Mapping, "a mapping", "write lipschitz: {residual: {kind: ...}}"),
-    "relations": (list, "a list of texts", "write relations: [abs(u - v) <= 0.5, ...]"),
-    "coordinates": (Mapping, "a mapping", "write coordinates: {dx: ux - vx, ...}"),
-    "expect": (Mapping, "a mapping", 'write expect: {verdict: holds, "path <=": 1}'),
-}
 Absent = Callable[[str], bool]
 
 
@@ -89,30 +82,25 @@ class SpecChecker:
         readers: dict[str, Callable[[str, Any], Any]] = {
             **dict.fromkeys(PLAIN, lambda name, section: validate(PLAIN[name], section, (name,), self.problems)),
             **dict.fromkeys((k for k in COMPONENTS if "." not in k), lambda name, section: self.component((name,), section)),
-            **dict.fromkeys(_Values.model_fields, self.value),
+            "domain": self.value,
             "sampling": self.sampling,
             "lipschitz": self.lipschitz,
             "expect": self.expect,
+            "relations": self.value,
+            "coordinates": self.value,
             "hidden": self.hidden,
             **{name: lambda key, section: self.contributed[key].read(self, section) for name in self.contributed},
         }
         head = tuple(_Head.model_fields)
         self.problems += [unknown_key((k,), (*head, *readers, "extends", "matrix")) for k in data if k not in (*head, *readers)]
         top = validate(_Head, {k: data[k] for k in head if k in data}, (), self.problems)
-        parts = {k: read(k, data[k]) for k, read in readers.items() if k in data and self.shaped(k, data[k])}
+        parts = {name: read(name, data[name]) for name, read in readers.items() if name in data}
         if isinstance(data.get("controller"), dict):
             parts["goal"] = self.goal(data["controller"])
         given = {k: v for k, v in parts.items() if v is not None}
         more = {k: given.pop(k) for k in self.contributed if k in given}
         study = next((k for k in more if self.contributed[k].alone), "recording" if measured(data, self.contributed) else "")
         return s.Config(name=top.name if top else "", seed=top.seed if top else 0, sections=more, study=study, **given)
-
-    def shaped(self, name: str, section: Any) -> bool:
-        """Has a section the shape that it has to have?"""
-        kind, what, hint = SHAPES.get(name, (object, "", ""))
-        if not isinstance(section, kind):
-            self.say((name,), f"found {shown(section)}; expected {what}", hint)
-        return isinstance(section, kind)
 
     def component(self, path: At, section: Any, kinds: tuple[str, ...] = (), absent: Absent | None = None) -> Any:
         """A section whose `kind` is a plugin's: its config, with its own checks made.
@@ -222,7 +210,10 @@ class SpecChecker:
                 self.say(place, f"no plugin provides executor '{name}'", near(name, executors))
         return config
 
-    def lipschitz(self, _: str, section: Mapping[str, Any]) -> dict[str, Any]:
+    def lipschitz(self, _: str, section: Any) -> dict[str, Any] | None:
+        if not isinstance(section, Mapping):
+            self.say(("lipschitz",), f"found {shown(section)}; expected a mapping", "write lipschitz: {residual: {kind: ...}}")
+            return None
         self.problems += [unknown_key(("lipschitz", k), BOUNDED) for k in section if k not in BOUNDED]
         return {k: self.component(("lipschitz", k), v) for k, v in section.items() if k in BOUNDED}
 
@@ -236,9 +227,15 @@ class SpecChecker:
         return config
 
     def value(self, name: str, section: Any) -> Any:
-        config = validate(_Values, {name: section}, (), self.problems)
-        found = None if config is None else getattr(config, name)
-        return tuple(found) if isinstance(found, list) else found
+        what = f"found {shown(section)}; expected"
+        if name == "relations" and not isinstance(section, list):
+            self.say((name,), f"{what} a list of texts", "write relations: [abs(u - v) <= 0.5, ...]")
+        elif name == "coordinates" and not isinstance(section, Mapping):
+            self.say((name,), f"{what} a mapping", "write coordinates: {dx: ux - vx, ...}")
+        elif (config := validate(_Values, {name: section}, (), self.problems)) is not None:
+            found = getattr(config, name)
+            return tuple(found) if isinstance(found, list) else found
+        return None
 
     def hidden(self, _: str, section: Any) -> s.HiddenConfig | None:
         """A word, or a mapping with `sample`."""
@@ -252,7 +249,10 @@ class SpecChecker:
         self.say(("hidden",), what, hint if hint.startswith("did") else s.HIDDEN_HINT)
         return None
 
-    def expect(self, _: str, section: Mapping[str, Any]) -> dict[str, Any]:
+    def expect(self, _: str, section: Any) -> dict[str, Any] | None:
+        if not isinstance(section, Mapping):
+            self.say(("expect",), f"found {shown(section)}; expected a mapping", 'write expect: {verdict: holds, "path <=": 1}')
+            return None
         for key, value in section.items():
             if (message := key_problem(key, value)) is not None:
                 self.say(("expect", key), message, where="key")

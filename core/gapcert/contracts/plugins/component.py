@@ -59,7 +59,7 @@ EXECUTED = (
     Argument("--view", "open a live Rerun viewer", {"action": "store_true"}),
     Argument("--quiet -q", "no progress; warnings, as of repaired data, stay", {"action": "store_true"}),
 )
-"""What a command takes that executes a spec; `gapcert.cli.main:execute` is its function."""
+"""What a command takes that executes a spec; `gapcert.cli.commands:execute` is its function."""
 
 
 @final
