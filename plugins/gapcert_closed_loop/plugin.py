@@ -12,6 +12,6 @@ def gapcert_components() -> list[Component]:
             "closed_loop",
             "runs of the controller on the simulator",
             "gapcert_closed_loop.study:ClosedLoopStudy",
-            "gapcert_closed_loop.study:ClosedLoopSection",
+            "gapcert_closed_loop.section:ClosedLoopSection",
         )
     ]

@@ -1,41 +1,15 @@
-"""The section `closed_loop:` of a spec, carried out: the controllers, with γ and without, on the backend."""
+"""The section `closed_loop:` of a spec carried out: the controllers, with γ and without, on the backend."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any, final
 
-from pydantic import Field
+from gapcert.plugin import Build, NoStart, Outcome, Stages, Study, beta_of, of_config
 
-from gapcert.plugin import POLICIES, Build, NoStart, Outcome, Policy, SpecSection, Stages, Study, beta_of, of_config
-from gapcert.plugin import sections as s
-
-from .closed_loop import ClosedLoop, StartsFrom, compare_loops
+from .closed_loop import ClosedLoop, compare_loops
 from .loop_audit import Oracle, loop_failures
-
-
-@final
-class ClosedLoopConfig(s.Section):
-    """Runs of the controller on the backend, with γ beside without γ; those with γ are an audit, with a confidence 1 − β.
-
-    Starts are drawn where both win, or with `starts_from: without_gamma` where the controller without γ does; of these,
-    those that the controller with γ refuses are counted. `policies`: by default all that the controllers know.
-    """
-
-    steps: s.Count = Field(600, description="of each run, in periods")
-    starts: s.Count = Field(100, description="runs per policy, at most")
-    confidence: s.Probability = Field(0.999, description="1 − β of what the runs with γ show")
-    policies: list[Policy] = Field(list(POLICIES), min_length=1, description="which valid inputs are applied, in turn")
-    starts_from: StartsFrom = Field("both", description="where both controllers win, or where the one without γ does")
-    seed: s.Whole | None = Field(None, description="of the starts; default: the spec's")
-
-
-@final
-class ClosedLoopSection(SpecSection):
-    model = ClosedLoopConfig
-    about = "runs of the controller on the simulator"
-    needs = ("controller",)
-    simulated = True
+from .section import ClosedLoopConfig
 
 
 @final

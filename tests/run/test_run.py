@@ -11,7 +11,7 @@ import pytest
 import gapcert as gc
 import gapcert_cells
 from gapcert.cli.main import main
-from gapcert.contracts.controllers.control import POLICIES
+from gapcert.contracts.controllers.policies import POLICIES
 from gapcert_figures.data import Figures
 
 MODEL = {

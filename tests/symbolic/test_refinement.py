@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 import gapcert
 from gapcert import Box, Goal, Interval, Region, UsageError
-from gapcert.contracts.controllers.control import POLICIES
+from gapcert.contracts.controllers.policies import POLICIES
 from gapcert.plugin import Synthesizer
 from gapcert_cells import GridController, Splits, Successors, SuccessorsByLevel
 from gapcert_cells.testing import Band, Rod, SynthesizerContract, rod_problem, rod_reach_avoid

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from gapcert import Box, Domain, Goal, Interval, Model, Region, StateSpec, SynthesisProblem, closed_loop
-from gapcert.contracts.controllers.control import POLICIES
+from gapcert.contracts.controllers.policies import POLICIES
 from gapcert.testing.toys import Drift
 from gapcert_cells import Along, GridController, Successors
 from gapcert_cells.testing import Band
