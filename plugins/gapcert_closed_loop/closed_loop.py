@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
@@ -36,8 +36,10 @@ from gapcert.plugin import (
 from .loop_audit import Oracle, audited
 from .prediction import summary as learned_summary
 
+if TYPE_CHECKING:
+    from .section import StartsFrom
+
 SHARES = 4  # shares per worker; chosen, not measured
-StartsFrom = Literal["both", "without_gamma"]
 
 
 @final

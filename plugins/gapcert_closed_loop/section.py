@@ -1,4 +1,4 @@
-"""The section `closed_loop:` of a spec."""
+"""The section `closed_loop:` of a spec: every spec is read with it, so that it needs nothing of what the study needs to run."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from typing import Literal, final
 from pydantic import Field
 
 from gapcert.plugin import POLICIES, Count, Policy, Probability, Section, SpecSection, Whole
+
+StartsFrom = Literal["both", "without_gamma"]
 
 
 @final
@@ -21,9 +23,7 @@ class ClosedLoopConfig(Section):
     starts: Count = Field(100, description="runs per policy, at most")
     confidence: Probability = Field(0.999, description="1 − β of what the runs with γ show")
     policies: list[Policy] = Field(list(POLICIES), min_length=1, description="which valid inputs are applied, in turn")
-    starts_from: Literal["both", "without_gamma"] = Field(
-        "both", description="where both controllers win, or where the one without γ does"
-    )
+    starts_from: StartsFrom = Field("both", description="where both controllers win, or where the one without γ does")
     seed: Whole | None = Field(None, description="of the starts; default: the spec's")
 
 

@@ -1,4 +1,4 @@
-"""A spec's `closed_loop:` section carried out: the controllers, with γ and without, on the backend."""
+"""The section `closed_loop:` of a spec carried out: the controllers, with γ and without, on the backend."""
 
 from __future__ import annotations
 

@@ -14,11 +14,12 @@ import numpy.typing as npt
 from gapcert import Array, Interval, Model, Recording, Trajectory, UsageError
 from gapcert.plugin import Coordinates, RelativeModel, Zone, damage_told, difference, magnitude, stated_units, without_units
 from gapcert_monitor.thresholds import THRESHOLDS
-from gapcert_recordings import Table, Transitions, axes, inspect
+from gapcert_recordings import Transitions, axes
 from gapcert_verify import Evidence, bounds, load, zone
 
 if TYPE_CHECKING:
     from gapcert.plugin import Certificate, Declaration, Predictor
+    from gapcert_recordings import Table
 
 Band = Callable[[Array], tuple[Array, Array]]
 
@@ -361,6 +362,7 @@ class Monitor:
 def read_log(path: Path | str, certified: Certified) -> Recording:
     """A log by its columns, which bear the names of states and inputs; or the recording of a spec, which maps them."""
     from gapcert.plugin import load_spec
+    from gapcert_recordings import inspect
 
     where = Path(path)
     if where.suffix in (".yaml", ".yml"):

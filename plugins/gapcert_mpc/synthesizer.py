@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, final
 
-from gapcert.plugin import Controller, Domain, Goal, Model, SynthesisProblem, Synthesizer, UsageError
+from gapcert.plugin import Controller, Domain, Goal, Model, Problem, SynthesisProblem, Synthesizer, UsageError, validate
 from gapcert_cells import loading
 
 from .config import MpcConfig
@@ -29,7 +29,12 @@ class Mpc(Synthesizer):
     name = "mpc"
 
     def __init__(self, **options: Any) -> None:
-        self.options = MpcConfig(**{name: option for name, option in options.items() if option is not None})
+        problems: list[Problem] = []
+        given = {name: option for name, option in options.items() if option is not None}
+        made = validate(MpcConfig, given, ("controller",), problems)
+        if problems:
+            raise UsageError("; ".join(f"{'.'.join(map(str, p.path))}: {p.message}" for p in problems))
+        self.options: MpcConfig = made
         self.starts = STARTS[self.options.linearisation]
 
     @property

@@ -195,3 +195,17 @@ def test_a_steady_section_is_what_a_step_makes_of_it() -> None:
     after = np.abs(section.moved) @ size + np.abs(section.H) @ (c + G @ (away + section.support @ size))
     assert size == pytest.approx(after, rel=1e-9)
     assert (size > section.steady(c, G, 0.0)).all()
+
+
+@pytest.mark.parametrize(
+    ("option", "says"),
+    [
+        ({"horizon": 0}, "controller.horizon: found 0; expected greater than or equal to 1"),
+        ({"solver": "nope"}, "controller.solver: found 'nope'; expected 'auto', 'osqp', 'piqp' or 'clarabel'"),
+        ({"horizons": 5}, "controller.horizons: unknown key 'horizons'"),
+    ],
+)
+def test_an_option_that_is_none_is_refused_where_it_is_given(option, says):
+    with pytest.raises(UsageError) as error:
+        Mpc(**option)
+    assert str(error.value) == says

@@ -25,7 +25,7 @@ class Least:
     """z → z with a_k = |z̄_k − ẑ_k| + ε, s by its recursion, and the least σ ≥ Mσ + |H|(c + G a_s + ε) that holds s_N.
 
     Rows ask for smaller s, a and σ, so that a trajectory that keeps them with any tube keeps them with this one. Of two such σ
-    the pointwise least is another: there is a least one. Policy iteration finds it.
+    the pointwise least is another: there is a least one. Policy iteration finds it. The program leaves them free at no cost.
     """
 
     def __init__(self, program: Program) -> None:

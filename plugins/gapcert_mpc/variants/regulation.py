@@ -135,6 +135,7 @@ def margin(nominal: Nominal, frame: Frame, section: Section, x: Array, u: Array,
 
     With z_s = (x, u), ξ = x + e, the mean value theorem gives F(ξ, ·) − F(z_s) = M e, M in the hull of F′ [I; K] over the set,
     and |H(F − x + g)| ≤ |ΛHe| + |(HM − ΛH) e| + |H(F(z_s) − x)| + |H| γ̄ ≤ b for any Λ: γ̄ bounds what is left over the set.
+    Intervals are rounded outwards, and the linearisation that made the set is not trusted.
     """
     H, P, K, n = section.H, section.P, section.K, len(x)
     # |e| ≤ |P||He| + |I − PH||e|: the second is rounding, and solved for.
