@@ -298,7 +298,7 @@ def _blocks(items: list[Any], size: int) -> list[list[Any]]:
 
 
 def to_vector(rotation: Array) -> Array:
-    """Quaternions (n, 4), of any length, → axes times angles in [0, π] (n, 3); no row's bits depend on its neighbours."""
+    """Quaternions w, x, y, z (n, 4) of any length → axes times angles in [0, π] (n, 3); no row's bits depend on another."""
     w, x, y, z = rotation.T
     sign = np.where(w < 0, -1.0, 1.0)
     norm = np.sqrt(x * x + y * y + z * z)
@@ -308,7 +308,7 @@ def to_vector(rotation: Array) -> Array:
 
 
 def from_vector(vector: Array) -> Array:
-    """(n, 3) → (n, 4) with w ≥ 0 up to an angle of π."""
+    """Back, row by row as well: (n, 3) → unit quaternions (n, 4) with w ≥ 0 up to an angle of π."""
     x, y, z = vector.T
     angle = np.sqrt(x * x + y * y + z * z)
     scale = np.divide(np.sin(angle / 2), angle, out=np.full_like(angle, 0.5), where=angle > 0)

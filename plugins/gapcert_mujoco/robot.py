@@ -100,7 +100,7 @@ def thrusters(model: Any) -> tuple[Thruster, ...]:
 
 
 def motors(path: Path) -> tuple[Motor, ...]:
-    """Of the file: those that are alone at a hinge or slide, with a gear; one without a name has its joint's."""
+    """Actuators of the file that are a plain effort, alone at a hinge or slide; one without a name has its joint's."""
     spec = mujoco.MjSpec.from_file(str(path))
     if not list(spec.actuators):
         return ()

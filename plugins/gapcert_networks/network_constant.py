@@ -3,6 +3,7 @@
 The network y = W_l σ(… σ(W_0 x + b_0) …) + b_l has elementwise activations with slopes in [0, 1]; one more on the output
 changes nothing. With diagonal multipliers Λ_i ≻ 0 and ρ for which the matrix of LipSDP is positive definite,
 ‖y(x) − y(x′)‖₂ ≤ √ρ·√(Σ_k s_k² (x_k − x′_k)²) (Fazlyab et al. 2019): ρ = L², no multiplier in the last block.
+So that floats hold the sizes of its layers well, it is balanced before, by powers of two alone.
 """
 
 from __future__ import annotations

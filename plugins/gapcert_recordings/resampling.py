@@ -17,8 +17,6 @@ import numpy.typing as npt
 from gapcert.plugin import SHORTEST, TURN, Array, Bools, Hold, StateSpec, Trajectory, UsageError, times
 from gapcert_recordings.thresholds import THRESHOLDS
 
-from .smoothing import absurd, filled_in, noise_floor, smoothed
-
 Rows = npt.NDArray[np.intp]
 JITTER = 1e-3  # of the sampling period: below that, samples are evenly spaced
 SHOWN = 3  # places of a kind that are told
@@ -333,6 +331,9 @@ def _knots(at: Array, u: Array) -> tuple[Array, Array]:
 def _smooth(
     t: Array, y: Array, offset: Array, knots: Array, u: Array, outputs: Sequence[StateSpec], dt: float, log: Log
 ) -> Piece:
+    # Its filters load slowly, and a page of a report takes the words of `repairs` alone.
+    from .smoothing import absurd, filled_in, noise_floor, smoothed
+
     there: Bools = np.isfinite(y)
     names = [s.name for s in outputs]
     wild = np.stack([absurd(np.where(there[:, j], y[:, j], 0.0), there[:, j]) for j in range(len(names))], axis=-1)

@@ -228,7 +228,10 @@ def _solve(matrix: Array, target: Array, cost: Array, slopes: Array | None = Non
 
 
 def parse(text: str, axes: Sequence[str]) -> Term | Expression:
-    """The function that `text` writes over named axes; UsageError where it is outside the grammar or names no axis."""
+    """The function that `text` writes over named axes: a product of one-dimensional factors where it is one, or an expression.
+
+    UsageError where it is outside the grammar or names no axis.
+    """
     try:
         node = read(text)
     except MalformedError as error:
