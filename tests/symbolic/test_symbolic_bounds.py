@@ -123,7 +123,7 @@ def test_more_of_the_vehicle_s_cells_win_without_it(monkeypatch: pytest.MonkeyPa
     steering straight on keeps the heading, and so its cell, of which the closed box touches both neighbours.
     """
     made, problem, *_ = published()
-    made.growth = None
+    made = replace(made, growth=None)
     assert made.synthesize(replace(problem)).evidence["winning_cells"] == 53_046 + 140
     monkeypatch.setattr(Enclosed, "unmoved", lambda self, u: np.zeros((len(u), self.model.nx), dtype=bool))
     assert made.synthesize(replace(problem)).evidence["winning_cells"] == 48_647 + 140
