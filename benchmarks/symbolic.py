@@ -140,9 +140,9 @@ def sine() -> float:
 def alone(case: Case, runs: int, file: str) -> dict[str, Any]:
     """Ours, in this process: seconds and MB, and what it won, held against a file of the peer's where there is one."""
     made, asked = problem(case)
-    made.threads = 1
-    coarse = Symbolic(align="scots", eta=dict(made.eta), growth=made.growth, error=made.error, threads=1)
-    coarse.eta |= {n: COARSER * made.eta[n] for n in asked.goal.stay.names}
+    made = replace(made, threads=1)
+    eta = {**made.eta, **{n: COARSER * made.eta[n] for n in asked.goal.stay.names}}
+    coarse = Symbolic(align="scots", eta=eta, growth=made.growth, error=made.error, threads=1)
     coarse.synthesize(asked)
     before, spent = memory("VmRSS"), []
     Path("/proc/self/clear_refs").write_text("5")
@@ -154,7 +154,7 @@ def alone(case: Case, runs: int, file: str) -> dict[str, Any]:
     assert controller is not None
     peak = memory("VmHWM")
     fresh, asked = problem(case)
-    fresh.threads = 1
+    fresh = replace(fresh, threads=1)
     start = time.process_time()
     fresh.synthesize(asked)
     first = time.process_time() - start

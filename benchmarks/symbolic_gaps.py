@@ -45,8 +45,7 @@ def certified(spec: Spec) -> gc.GapFunction:
 
 def synthesized(spec: Spec, gap: gc.GapFunction) -> tuple[float, float, Any]:
     """CPU seconds of the gap over blocks, and of the whole, the better of two; and the controller's evidence."""
-    model, made = spec.build("model"), spec.build("controller")
-    made.threads = 1
+    model, made = spec.build("model"), replace(spec.build("controller"), threads=1)
     domain = gc.Domain.of(model, dict(spec.config.domain))
     best, bounded, evidence = np.inf, 0.0, None
     for _ in range(2):

@@ -10,6 +10,7 @@ import argparse
 import os
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 
 import gapcert_cells
 
@@ -40,7 +41,7 @@ def problems(quick: bool, large: bool) -> Iterator[tuple[str, Symbolic, gc.Synth
 
 def timed(made: Symbolic, asked: gc.SynthesisProblem, solver: str, threads: int) -> tuple[gapcert_cells.GridController, float]:
     """Of the second of two."""
-    made.solver, made.threads = solver, threads
+    made = replace(made, solver=solver, threads=threads)
     made.synthesize(asked)
     begin = time.perf_counter()
     return made.synthesize(asked), time.perf_counter() - begin

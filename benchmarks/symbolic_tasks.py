@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +38,7 @@ LEAN = ("-DARMA_DONT_USE_WRAPPER", "-DARMA_DONT_USE_BLAS", "-DARMA_DONT_USE_LAPA
 def alone(runs: int, file: str) -> dict[str, Any]:
     """Ours, in this process: seconds and MB, and what it won, held against a file of the peer's where there is one."""
     spec = gc.load_spec(CAR)
-    model, made = spec.build("model"), spec.build("controller")
-    made.threads = 1
+    model, made = spec.build("model"), replace(spec.build("controller"), threads=1)
     domain = gc.Domain.of(model, dict(spec.config.domain))
     asked = gc.SynthesisProblem(model, None, domain, spec.goal(domain))
     coarse = Symbolic({n: c // 3 for n, c in made.cells.items()}, made.inputs, input_range=made.input_range, threads=1)
