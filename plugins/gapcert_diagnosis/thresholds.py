@@ -13,7 +13,7 @@ class Thresholds:
 
     # the package itself
     window: float = threshold(1.2, "s, one coordinate: with it 101 of 106 hidden effects were named, as measured on fresh logs")
-    coupled_window: float = chosen(0.8, "s, several coordinates: as `window`, shorter since errors spread between them")
+    coupled_window: float = decides(0.8, "s, several coordinates: as `window`, shorter since errors spread between them")
     fitted_values: int = chosen(16_000, "measured values at most: more cost time, and say little new about causes")
     guard_windows: int = chosen(4, "at least, among those that judge what the others suggest")
     usual_samples: int = chosen(30, "in a window at least, before windows are made shorter to be more")
