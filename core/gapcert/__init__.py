@@ -12,7 +12,7 @@ _HOME = homes(
     {
         "gapcert.certification.certificate": "Certificate",
         "gapcert.certification.certify": "certify",
-        "gapcert.certification.declared": "Declaration",
+        "gapcert.certification.declaration": "Declaration",
         "gapcert.certification.gates.hidden_state": "HiddenPlan",
         "gapcert.certification.routes": "Request",
         "gapcert.certification.samples.designs": "AdaptiveSampling GridSampling LatticeSampling",

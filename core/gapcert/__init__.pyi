@@ -1,7 +1,7 @@
 from gapcert import plugin as plugin
 from gapcert.certification.certificate import Certificate as Certificate
 from gapcert.certification.certify import certify as certify
-from gapcert.certification.declared import Declaration as Declaration
+from gapcert.certification.declaration import Declaration as Declaration
 from gapcert.certification.gates.hidden_state import HiddenPlan as HiddenPlan
 from gapcert.certification.routes import Request as Request
 from gapcert.certification.samples.designs import AdaptiveSampling as AdaptiveSampling

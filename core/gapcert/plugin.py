@@ -14,7 +14,7 @@ _HOME = homes(
         "gapcert.certification.certify": "digest",
         "gapcert.certification.compatibility": "unmatched unpaired",
         "gapcert.certification.coordinates": "Coordinates RelativeModel in_words",
-        "gapcert.certification.declared": "Declaration",
+        "gapcert.certification.declaration": "Declaration",
         "gapcert.certification.gates.augment": "forgets widen",
         "gapcert.certification.gates.hidden_distribution": "Law beginning",
         "gapcert.certification.gates.hidden_state": "Gate",

@@ -13,7 +13,7 @@ from gapcert.certification.compatibility import unpaired as unpaired
 from gapcert.certification.coordinates import Coordinates as Coordinates
 from gapcert.certification.coordinates import RelativeModel as RelativeModel
 from gapcert.certification.coordinates import in_words as in_words
-from gapcert.certification.declared import Declaration as Declaration
+from gapcert.certification.declaration import Declaration as Declaration
 from gapcert.certification.gates.augment import forgets as forgets
 from gapcert.certification.gates.augment import widen as widen
 from gapcert.certification.gates.hidden_distribution import Law as Law

@@ -7,7 +7,7 @@ import gapcert
 CONFIG = "gapcert_bounds.config"
 _SAMPLED = {"claim": "statistical"}
 _ESTIMATORS: dict[str, tuple[str, str, dict[str, Any]]] = {
-    "declared": ("declared:Declared", "constants that the user states", {}),
+    "declared": ("declared_constants:Declared", "constants that the user states", {}),
     "interval": ("interval:IntervalJacobian", "constants proved from the equations of both systems", {}),
     "wood-zhang": ("wood_zhang:WoodZhang", "constants estimated from sampled slopes by extreme value theory", _SAMPLED),
     "gradient-elite": (

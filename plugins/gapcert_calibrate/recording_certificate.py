@@ -76,7 +76,7 @@ class Windows:
 
     @property
     def unused(self) -> dict[str, int]:
-        """The rows of which nothing is said, by reason."""
+        """Rows in all, and those that the certificate says nothing of, by reason."""
         return {"all": self.rows, "no_transition": self.skipped, "outside": self.outside}
 
     def of(self, windows: Ints) -> Windows:

@@ -116,7 +116,7 @@ class Splits:
     first: npt.NDArray[Any]
 
     PAINTED: ClassVar[int] = 2**26
-    """Places that are told apart one by one at most."""
+    """Finest cells, at most, for which an adversarial policy measures depths one by one."""
 
     @property
     def finest(self) -> tuple[int, ...]:

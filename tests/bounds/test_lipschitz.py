@@ -14,7 +14,7 @@ from scipy import stats
 import gapcert as gc
 from gapcert.testing import LipschitzContract
 from gapcert_bounds.config import DeclaredConfig, WoodZhangConfig
-from gapcert_bounds.constants.declared import Declared
+from gapcert_bounds.constants.declared_constants import Declared
 from gapcert_bounds.constants.interval import IntervalJacobian
 from gapcert_bounds.constants.wood_zhang import ReverseWeibull, WoodZhang
 from gapcert_bounds.testing.fields import Kink, Nothing, Waves, lipschitz_problem

@@ -15,7 +15,7 @@ from rough_fields import Coarse
 import gapcert as gc
 from gapcert.certification.samples.executors import threads
 from gapcert.contracts.gaps.gap import GapFamily
-from gapcert_bounds.constants.declared import Declared
+from gapcert_bounds.constants.declared_constants import Declared
 from gapcert_bounds.constants.interval import IntervalJacobian
 from gapcert_bounds.families.basis import Basis
 from gapcert_bounds.families.constant import Constant

@@ -13,7 +13,7 @@ import gapcert as gc
 from gapcert.certification.routes import Request
 from gapcert.certification.samples.executors import threads
 from gapcert.contracts.gaps.predictor import Samples
-from gapcert_bounds.constants.declared import Declared
+from gapcert_bounds.constants.declared_constants import Declared
 from gapcert_bounds.families.envelope import Envelope
 from gapcert_bounds.testing.fields import Field, Kink, Nothing, Waves, gap_problem
 from gapcert_networks import theorem1_network as covered

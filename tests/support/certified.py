@@ -1,7 +1,7 @@
 """A certificate of smooth waves against nothing, under their true constants, saved where a test wants it."""
 
 from gapcert.certification.certify import certify
-from gapcert_bounds.constants.declared import Declared
+from gapcert_bounds.constants.declared_constants import Declared
 from gapcert_bounds.testing.fields import Nothing, Waves
 
 

@@ -14,7 +14,7 @@ from typing import Any, final
 from gapcert.certification.certificate import Certificate
 from gapcert.certification.certify import certify, digest
 from gapcert.certification.coordinates import Coordinates, RelativeGap, RelativeModel, RelativeSystem
-from gapcert.certification.declared import Declaration
+from gapcert.certification.declaration import Declaration
 from gapcert.certification.gates.augment import augment, augment_model, unmeasured, widen
 from gapcert.certification.gates.hidden_state import HiddenPlan
 from gapcert.certification.routes import Request

@@ -8,7 +8,7 @@ from typing import Any, final
 import numpy as np
 
 from gapcert.plugin import Array, GapFamily, GapFunction, GapProblem, Interval, Pulse, supremum
-from gapcert_bounds.constants.declared import named
+from gapcert_bounds.constants.declared_constants import named
 
 from .envelope import Envelope
 from .multilinear import made
