@@ -7,8 +7,9 @@ these, until single thresholds are left (or a few that act together alone). They
 until nothing changes.
 
 A share stays below 1, and of a factor between 1 and 2 the distance to 1 is halved or doubled; of a grid of values every other
-one stays, or means come between them. An answer that takes ten times as long counts as changed. Answers are kept in
-runs/thresholds.jsonl, and asked again where the code has changed.
+one stays, or means come between them. Which way a threshold goes depends on its name and the seed; both ways are asked side by
+side. An answer that takes ten times as long counts as changed. Answers are kept in runs/thresholds.jsonl, and asked again where
+the code has changed.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -36,6 +39,8 @@ QUICK = ("nothing 0", "nothing 1", "faint 0", "singles 0")
 """Questions that take some ten seconds together."""
 SECONDS = 540.0
 """Of a quick run: what is open then goes on with the next one."""
+NO_SHARES = ("wide_interval", "counted_floor", "recurrence", "often_errors")
+"""Widths, mean squares, seconds and standard errors: 1 is a number like others to them."""
 PATIENCE = 3600.0
 """Seconds for an answer under no changes; others get ten times what that took, and a minute."""
 Changes = Mapping[str, Any]
@@ -49,8 +54,8 @@ def tables() -> dict[str, Any]:
     return {name: importlib.import_module(name).THRESHOLDS for name in names}
 
 
-def changed(value: Any, up: bool) -> Any:
-    """A value halved, or doubled; in Python's own types."""
+def changed(value: Any, up: bool, share: bool = True) -> Any:
+    """A value halved, or doubled; in Python's own types. `share`: a number below 1 stays there."""
     if isinstance(value, tuple) and len(value) > 2:
         means = [(a + b) / 2 for a, b in itertools.pairwise(value)]
         kept = [*value, *means] if up else value[::2]
@@ -59,7 +64,7 @@ def changed(value: Any, up: bool) -> Any:
         return tuple(changed(v, up) for v in value)
     if isinstance(value, int):
         return 2 * value if up else max(1, round(value / 2))
-    if 0.5 <= value < 1:
+    if share and 0.5 <= value < 1:
         return 1 - (1 - value) / 2 if up else value / 2
     if 1 < value < 2:
         return 1 + (value - 1) * (2.0 if up else 0.5)
@@ -75,8 +80,9 @@ def draws(seed: int, only: str) -> list[dict[str, Any]]:
         for f in fields(table)
         if f.metadata["reason"].endswith("chosen, not measured")
     ]
-    ways = np.random.default_rng(seed).random(len(chosen)) < 0.5
-    both = ({key: changed(v, bool(up ^ turn)) for (key, v), up in zip(chosen, ways, strict=True)} for turn in (False, True))
+    ways = {key: bool(hashlib.sha256(f"{seed} {key}".encode()).digest()[0] & 1) for key, _ in chosen}
+    shares = {key: key.partition(":")[2] not in NO_SHARES for key, _ in chosen}
+    both = ({key: changed(v, ways[key] ^ turn, shares[key]) for key, v in chosen} for turn in (False, True))
     return [{key: new for (key, v) in chosen if (new := made[key]) != v} for made in both]
 
 
@@ -195,29 +201,31 @@ def main() -> int:
     battery = Battery(
         list(QUICK) if given.quick else asked, given.results, time.monotonic() + SECONDS if given.quick else np.inf
     )
-    rows, ended = list[str](), True
     ways = draws(given.seed, given.only)
-    cleared = set[str]()
-    for way, changes in enumerate(ways):
-        found: dict[str, tuple[Any, str]] = {}
-        try:
-            for question in battery.questions:
-                battery.answer(question, {})
-            battery.decided(changes, found)
-            cleared = cleared & changes.keys() if way else set(changes)
-        except TimeoutError:
-            ended, cleared = False, set()
-        now = tables()
-        for key, (value, question) in sorted(found.items()):
-            module, _, name = key.partition(":")
-            room = module.removesuffix(".thresholds")
-            rows.append(f"| {room} | `{name}` | {getattr(now[module], name)} | {value} | {question} |")
+    now, every, found = tables(), len(ways[0].keys() | ways[1].keys()), [dict[str, tuple[Any, str]]() for _ in ways]
+    alone, ended = dict[str, str](), False
+    with ThreadPoolExecutor(2) as pool, suppress(TimeoutError):
+        list(pool.map(lambda question: battery.answer(question, {}), battery.questions))
+        list(pool.map(battery.decided, ways, found))
+        for key, (value, question) in (item for one in found for item in one.items()):
+            alone[key] = "yes" if battery.moved(question, {key: value}) else "no"
+        ended = True
+    rows = list[str]()
+    for key, (value, question) in sorted(item for one in found for item in one.items()):
+        module, _, name = key.partition(":")
+        cells = (
+            module.removesuffix(".thresholds"),
+            f"`{name}`",
+            getattr(now[module], name),
+            value,
+            question,
+            alone.get(key, ""),
+        )
+        rows.append(f"| {' | '.join(map(str, cells))} |")
     print(", ".join(f"{k}: {v}" for k, v in harness.machine().items()), "\n")
-    print("| room | threshold | is | changed to | moves the answer to |", "| --- | --- | --- | --- | --- |", *rows, sep="\n")
-    every = len(set().union(*draws(given.seed, given.only)))
-    state = (
-        f"{len(cleared)} of {every} thresholds change nothing, halved or doubled" if ended else "not all is asked: call again"
-    )
+    print("| room | threshold | is | changed to | moves the answer to | alone |", f"|{' --- |' * 6}", *rows, sep="\n")
+    cleared = f"{len(ways[0].keys() & ways[1].keys())} of {every} thresholds change nothing, halved or doubled"
+    state = cleared if ended else "not all is asked: call again"
     print(f"\n{len(battery.questions)} questions: {state}.")
     return 0
 

@@ -11,7 +11,7 @@ _HOME = homes(
         "gapcert.certification.certificate": (
             "Audit Certificate Ledger Record StateEvidence domain_data figures gap_digest saved_digest"
         ),
-        "gapcert.certification.certify": "digest",
+        "gapcert.certification.certify": "digest predictor_of",
         "gapcert.certification.compatibility": "unmatched unpaired",
         "gapcert.certification.coordinates": "Coordinates RelativeModel in_words",
         "gapcert.certification.declaration": "Declaration",

@@ -8,6 +8,7 @@ from gapcert.certification.certificate import figures as figures
 from gapcert.certification.certificate import gap_digest as gap_digest
 from gapcert.certification.certificate import saved_digest as saved_digest
 from gapcert.certification.certify import digest as digest
+from gapcert.certification.certify import predictor_of as predictor_of
 from gapcert.certification.compatibility import unmatched as unmatched
 from gapcert.certification.compatibility import unpaired as unpaired
 from gapcert.certification.coordinates import Coordinates as Coordinates

@@ -15,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.plugin import (
-    AffinePredictor,
     Array,
     Claim,
     Domain,
@@ -25,7 +24,6 @@ from gapcert.plugin import (
     LipschitzEstimator,
     LipschitzProblem,
     Model,
-    ModelPredictor,
     Predictor,
     Recording,
     Samples,
@@ -40,6 +38,7 @@ from gapcert.plugin import (
     in_words,
     npz_bytes,
     order_statistics,
+    predictor_of,
     registry,
     write_atomic,
 )
@@ -334,9 +333,7 @@ def _problem(
     size = np.abs(own.z[:, : model.nx]).max(axis=0) + np.abs(own.r).max(axis=0)
     e = np.asarray(model.resolution(size) + 4 * np.spacing(size))
     p = predictor if predictor is not None else getattr(family, "predictor", "affine")
-    chosen = ModelPredictor(p, model) if isinstance(p, Model) else p
-    if not isinstance(chosen, Predictor):
-        chosen = AffinePredictor.fit(samples) if chosen == "affine" else AffinePredictor.none(model.nx, len(domain.low))
+    chosen = predictor_of(p, samples, model, domain, CALLER)
     asked = LipschitzProblem(domain, chosen, e, _unanswered, model, model, seed)
     constants = (lipschitz or NoConstants()).bound(asked)
     return GapProblem(samples, domain, constants, chosen, e, "dominate", seed)

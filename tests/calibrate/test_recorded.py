@@ -161,6 +161,8 @@ def test_too_few_windows_say_how_many_are_needed() -> None:
         ({"fit": 1.0}, "expected a share"),
         ({"family": "multilinear"}, "points of its own choice"),
         ({"lipschitz": "wood-zhang"}, "a recording answers no questions"),
+        ({"predictor": "afine"}, "calibration: found predictor 'afine'; expected 'none'"),
+        ({"predictor": Drift(1, period=0.5)}, "the predictor's model does not fit the model: its period is 0.5 s"),
     ],
 )
 def test_what_does_not_fit_is_one_sentence(options: dict[str, Any], message: str) -> None:

@@ -562,7 +562,10 @@ FAULTS = {
     "test_options_name_their_kind": ("parts", '["planted"]', '["plated"]'),
     "test_unknown_options_are_refused": ("parts", 'extra="forbid", ', ""),
     "test_options_are_frozen": ("parts", ", frozen=True", ""),
+    "test_readers_tell_what_their_options_mean": ("parts", '["planted"]', '["planted"]\n    every: float = 1.0'),
 }
+HONEST_READER = HONEST.replace('"backend"', '"reader"')
+"""What the last of them asks are readers alone."""
 
 
 STUDY = (
@@ -624,7 +627,8 @@ def test_an_honest_declaration_passes(check, monkeypatch, tmp_path):
 @pytest.mark.contract
 @pytest.mark.parametrize("check", FAULTS)
 def test_a_faulty_declaration_is_caught(check, monkeypatch, tmp_path):
-    contract = declared(monkeypatch, tmp_path, f"planted_{list(FAULTS).index(check)}", *FAULTS[check])
+    honest = (HONEST_READER if "readers" in check else HONEST, PARTS)
+    contract = declared(monkeypatch, tmp_path, f"planted_{list(FAULTS).index(check)}", *FAULTS[check], honest=honest)
     with pytest.raises(AssertionError):
         getattr(contract, check)()
 

@@ -154,7 +154,7 @@ def measure(question: Question, store: Store, gate: Gate) -> GapProblem:
     held = () if symmetry is None else symmetry.axes
     sampling = sampling.holding(held)
     samples = store.samples("bound-0", sampling.first(domain), sampling.kept(domain))
-    p = _predictor(question.predictor, samples, residual.model, domain)
+    p = predictor_of(question.predictor, samples, residual.model, domain)
     store.emit(Event("stage-started", "lipschitz", {}))
     asked = replace(asked, predictor=p, held=held)
     constants = watched(asked, question.lipschitz.bound(asked), samples, store.emit)
@@ -177,23 +177,24 @@ def measure(question: Question, store: Store, gate: Gate) -> GapProblem:
     return replace(problem, samples=samples, emit=store.emit, folder=store.folder.parent / "fit")
 
 
-def _predictor(choice: Any, samples: Samples, model: Model, domain: Domain) -> Predictor:
+def predictor_of(choice: Any, samples: Samples, model: Model, domain: Domain, caller: str = "certify") -> Predictor:
+    """What is taken off before bounding: `none`, `affine`, a Predictor, what makes one of samples, or an extended Model."""
     if isinstance(choice, Predictor):
         return choice
     if isinstance(choice, Model):
         if said := unpaired(model, choice):
-            raise UsageError(f"certify: the predictor's model does not fit the model: {said}")
+            raise UsageError(f"{caller}: the predictor's model does not fit the model: {said}")
         return ModelPredictor(choice, model)
     if choice == "affine":
         return AffinePredictor.fit(samples)
     if callable(choice):
         if not isinstance(made := choice(samples, domain), Predictor):
-            raise UsageError(f"certify: what makes the predictor gave {made!r}; expected a Predictor")
+            raise UsageError(f"{caller}: what makes the predictor gave {made!r}; expected a Predictor")
         return made
     if choice == "none":
         return AffinePredictor.none(samples.r.shape[1], samples.z.shape[1])
     raise UsageError(
-        f"certify: found predictor {choice!r}; expected 'none', 'affine', a Predictor, what makes one, or an extended Model"
+        f"{caller}: found predictor {choice!r}; expected 'none', 'affine', a Predictor, what makes one, or an extended Model"
     )
 
 

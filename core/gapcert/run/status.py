@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, final
 
+from gapcert.contracts.plugins.registry import registry
 from gapcert.numerics.errors import INTERRUPTED
 from gapcert.run import journal
 from gapcert.run.folder import SPEC, alive, is_run, marked, owner, stored
@@ -134,8 +135,12 @@ class RunFolder:
 
     @property
     def kind(self) -> str:
-        """What the spec asks for."""
-        return next((k for k in ("compare", "diagnose") if self.spec.get(k) is not None), "certify")
+        """What the spec asks for: a study that answers alone, or `certify`."""
+        # Imported where a folder is asked about: it reads all sections.
+        from gapcert.spec.sections.plugin_sections import contributed
+
+        asked = (name for name, section in contributed(registry()).items() if section.alone and self.spec.get(name) is not None)
+        return next(asked, "certify")
 
     @cached_property
     def size(self) -> int:

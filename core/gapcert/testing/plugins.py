@@ -11,6 +11,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from gapcert.contracts.plugins.component import KINDS, Component, load
+from gapcert.contracts.plugins.options import ConfigContract
 from gapcert.contracts.plugins.registry import Registry, installed
 from gapcert.spec.sections.plugin_sections import SpecSection
 from gapcert.testing.checks import expect
@@ -92,6 +93,13 @@ class PluginContract(ABC):
     def test_options_are_frozen(self) -> None:
         for c, config in self._configs():
             expect(bool(config.model_config.get("frozen")), f"{_named(c)} can be changed; expected ConfigDict(frozen=True)")
+
+    def test_readers_tell_what_their_options_mean(self) -> None:
+        """Options are never read by their names: a spec asks a reader's config for its columns, and whether it resamples."""
+        for c, config in self._configs():
+            for option, method in (("columns", "channels"), ("every", "resampled")) if c.kind == "reader" else ():
+                told = getattr(config, method, None) not in (None, getattr(ConfigContract, method))
+                expect(told or option not in config.model_fields, f"{c.config} has `{option}`; expected its method `{method}`")
 
     def _declared(self) -> list[Component]:
         return list(load(f"{self.plugin}:gapcert_components")())

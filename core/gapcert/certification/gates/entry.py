@@ -47,9 +47,13 @@ def enter(
 ) -> Gate:
     """Both systems are functions of their arguments, hidden state is dealt with, inputs arrive; UsageError otherwise."""
     pulse, probes = Pulse(emit, "gates", unit="probes"), itertools.count(1)
+
+    def told(of: str) -> Callable[[str], None]:
+        return lambda what: pulse(next(probes), text=f"{of} {what}")
+
     for role, system in (("model", model), ("backend", backend)):
-        probed = purity(role, system, domain, executor, seed, lambda what, r=role: pulse(next(probes), text=f"{r} {what}"))  # type: ignore[misc]
-    gate = open_gate(model, backend, domain, plan, seed, lambda what: pulse(next(probes), text=f"hidden state, {what}"))
+        probed = purity(role, system, domain, executor, seed, told(role))
+    gate = open_gate(model, backend, domain, plan, seed, told("hidden state,"))
     pulse(next(probes), text="do inputs arrive?")
     if claim == "deterministic" and gate.distribution:
         raise UsageError(
