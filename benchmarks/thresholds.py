@@ -1,10 +1,10 @@
 """Which thresholds that were chosen, not measured, decide an answer of the battery: each halved or doubled.
 
 All are changed at once, each halved or doubled at random, and a second time the other way round. One by one it would be two
-batteries for each of some four hundred, which takes weeks. A battery whose answers stay clears all that was changed in it, as
-far as they do not make up for each other. Where a verdict or a cause changes, halves of the changes are tried, and halves of
-these, until single thresholds are left (or a few that act together alone). They are set back, and the battery is asked again,
-until nothing changes.
+batteries for each of some five hundred, which takes weeks. Where the verdict or a cause of a question changes, halves of the
+changes are tried, and halves of these, until single thresholds are left (or a few that act together alone). These are set back
+for this question and all that follow. A threshold that is left at the end was changed in every question, one way and the other,
+and no answer moved, as far as changes do not make up for each other.
 
 A share stays below 1, and of a factor between 1 and 2 the distance to 1 is halved or doubled; of a grid of values every other
 one stays, or means come between them. Which way a threshold goes depends on its name and the seed; both ways are asked side by
@@ -171,17 +171,13 @@ class Battery:
         return first | self.culprits(question, two, {**held, **first})
 
     def decided(self, changes: dict[str, Any], found: dict[str, tuple[Any, str]]) -> None:
-        """Fills in `module:name` → (its changed value, question), and takes these out of the changes, until no answer moves."""
-        clean = False
-        while not clean:
-            clean = True
-            for question in self.questions:
-                while self.moved(question, changes):
-                    clean = False
-                    for key, value in self.culprits(question, changes, {}).items():
-                        found[key] = value, question
-                        del changes[key]
-                        say(f"{key} = {value} decides {question}")
+        """Asks one question after another; what moves an answer goes from the changes to `module:name` → (value, question)."""
+        for question in self.questions:
+            while self.moved(question, changes):
+                for key, value in self.culprits(question, changes, {}).items():
+                    found[key] = value, question
+                    del changes[key]
+                    say(f"{key} = {value} decides {question}")
 
 
 def main() -> int:

@@ -314,7 +314,9 @@ def test_observers_hear_every_stage_and_cannot_kill_a_run(tmp_path):
 
 
 def test_certificates_of_other_specs_stand_beside(tmp_path):
-    (tmp_path / "other.yaml").write_text(json.dumps(BOUND_ONLY | {"name": "other", "gap": {"kind": "constant"}}))
+    # The other has more to do, which is left out.
+    more = {k: SPEC[k] for k in ("controller", "closed_loop")}
+    (tmp_path / "other.yaml").write_text(json.dumps(BOUND_ONLY | more | {"name": "other", "gap": {"kind": "constant"}}))
     spec = BOUND_ONLY | {"report": {"html": True, "rerun": False, "beside": [str(tmp_path / "other.yaml")]}}
     run = gc.run(spec, out=tmp_path / "runs")
     rows = run.summary["beside"]

@@ -29,6 +29,7 @@ from gapcert.run.journal import Journal
 from gapcert.run.status import RunFolder
 from gapcert.run.verdict import beside_nominal, code_of, nothing_won, refutations
 from gapcert.spec.expect import evaluate_expectations
+from gapcert.spec.sections.plugin_sections import contributed
 from gapcert.spec.spec import Spec, load_spec
 
 
@@ -264,7 +265,7 @@ def _controlled(build: Build, stages: Stages, folder: Path, asked: tuple[Synthes
 def _beside(build: Build, stages: Stages, own: Certificate, folder: Path) -> list[dict[str, Any]]:
     """This certificate and those of the specs named in `report.beside`, one row each; only their bounds are made."""
     rows = [_row(build.spec.config.name, own, stages.timings["certificate"])]
-    alone = [f"{section}=null" for section in ("controller", *build.spec.config.sections)]
+    alone = [f"{section}=null" for section in ("controller", *contributed(registry()))]
     for path in build.spec.config.report.beside:
         other = load_spec(build.spec.folder / path, (*alone, "certificate.attack=0", "expect=null"))
         if other.config.backend is None:
