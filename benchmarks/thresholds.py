@@ -4,8 +4,8 @@ All are changed at once, each halved or doubled at random, and a second time the
 batteries for each of some five hundred, which takes weeks. Where the verdict or a cause of a question changes, halves of the
 changes are tried, and halves of these, until single thresholds are left (or a few that act together alone). These are set back
 for this question and all that follow; a question whose answer moves yet again after four of these lies on an edge, and is told.
-A threshold that is left at the end was changed in every question, one way and the other, and no answer moved, as far as changes
-do not make up for each other.
+A threshold that is left at the end was changed in every question, one way and the other, and the answers of all others stayed,
+as far as changes do not make up for each other.
 
 A share stays below 1, and of a factor between 1 and 2 the distance to 1 is halved or doubled; of a grid of values every other
 one stays, or means come between them. Which way a threshold goes depends on its name and the seed; both ways are asked side by
@@ -207,31 +207,24 @@ def main() -> int:
     )
     ways = draws(given.seed, given.only)
     now, every, found = tables(), len(ways[0].keys() | ways[1].keys()), [dict[str, tuple[Any, str]]() for _ in ways]
-    alone, ended, edges = dict[str, str](), False, [list[str]() for _ in ways]
+    items, ended, edges = list[tuple[str, Any, str, str]](), False, [list[str]() for _ in ways]
     with ThreadPoolExecutor(2) as pool, suppress(TimeoutError):
         list(pool.map(lambda question: battery.answer(question, {}), battery.questions))
         list(pool.map(battery.decided, ways, found, edges))
-        items = [(key, *of) for one in found for key, of in one.items()]
-        moved = pool.map(lambda item: battery.moved(item[2], {item[0]: item[1]}), items)
-        alone = {item[0]: "yes" if moves else "no" for item, moves in zip(items, moved, strict=True)}
+        decisive = sorted((key, *of) for one in found for key, of in one.items())
+        moved = pool.map(lambda item: battery.moved(item[2], {item[0]: item[1]}), decisive)
+        items = [(*item, "yes" if moves else "no") for item, moves in zip(decisive, moved, strict=True)]
         ended = True
     rows = list[str]()
-    for key, (value, question) in sorted(item for one in found for item in one.items()):
+    for key, value, question, alone in items or [(key, *of, "") for one in found for key, of in sorted(one.items())]:
         module, _, name = key.partition(":")
-        cells = (
-            module.removesuffix(".thresholds"),
-            f"`{name}`",
-            getattr(now[module], name),
-            value,
-            question,
-            alone.get(key, ""),
-        )
+        cells = (module.removesuffix(".thresholds"), f"`{name}`", getattr(now[module], name), value, question, alone)
         rows.append(f"| {' | '.join(map(str, cells))} |")
     print(", ".join(f"{k}: {v}" for k, v in harness.machine().items()), "\n")
     print("| room | threshold | is | changed to | moves the answer to | alone |", f"|{' --- |' * 6}", *rows, sep="\n")
     tipped = sorted({question for one in edges for question in one})
     cleared = f"{len(ways[0].keys() & ways[1].keys())} of {every} thresholds change nothing, halved or doubled"
-    cleared += f"; {', '.join(tipped)} still move: many changes tip them" if tipped else ""
+    cleared += f", but for {', '.join(tipped)}, whose answers lie on an edge: many changes tip them" if tipped else ""
     state = cleared if ended else "not all is asked: call again"
     print(f"\n{len(battery.questions)} questions: {state}.")
     return 0

@@ -8,6 +8,7 @@ import pytest
 import gapcert as gc
 from gapcert.cli.main import main
 from gapcert.contracts.plugins.registry import Registry, installed
+from gapcert.plugin import Component
 from gapcert.run.status import RunFolder
 from gapcert.spec.schema import schema
 
@@ -43,6 +44,9 @@ def test_a_study_of_five_lines_is_carried_out(with_components, tmp_path):
     assert (done.summary["reason"], done.artifacts["knocks"], done.exit_code) == ("3 times on wood", 3, 0)
     assert json.loads((done.folder / "summary.json").read_text())["verdict"] == "knocked"
     assert RunFolder.at(done.folder).kind == "knock"
+    with_components(Component("study", "knock", "knocks", "no_such:Study", "no_such:Section"))
+    assert RunFolder.at(done.folder).kind == "certify"  # its package fails by now, and a list of runs goes on
+    with_components(*knocking.components())
     assert schema()["properties"]["knock"]["description"] == "knocks, and what they are on"
     with pytest.raises(gc.SpecError, match=r"knock: 'knock' needs 'model'"):
         gc.load_spec({k: v for k, v in spec.items() if k != "model"})

@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, final
 
-from gapcert.contracts.plugins.registry import registry
+from gapcert.contracts.plugins import registry
+from gapcert.contracts.plugins.component import load
 from gapcert.numerics.errors import INTERRUPTED
 from gapcert.run import journal
 from gapcert.run.folder import SPEC, alive, is_run, marked, owner, stored
@@ -136,11 +138,12 @@ class RunFolder:
     @property
     def kind(self) -> str:
         """What the spec asks for: a study that answers alone, or `certify`."""
-        # Imported where a folder is asked about: it reads all sections.
-        from gapcert.spec.sections.plugin_sections import contributed
-
-        asked = (name for name, section in contributed(registry()).items() if section.alone and self.spec.get(name) is not None)
-        return next(asked, "certify")
+        for study in registry.installed().of("study"):
+            if self.spec.get(study.name) is not None:
+                with suppress(Exception):  # a plugin's module may fail in any way, and a list of runs goes on
+                    if load(study.config).alone:
+                        return study.name
+        return "certify"
 
     @cached_property
     def size(self) -> int:
