@@ -38,6 +38,7 @@ _HOME = homes(
         "gapcert.contracts.plugins.presentation": "Shown View view",
         "gapcert.contracts.plugins.component": "ALLOW_CODE EXECUTED LOG RUN Answer Argument Arguments Component Context load",
         "gapcert.contracts.plugins.registry": "Registry hookimpl registry",
+        "gapcert.contracts.systems.arithmetic": "Arithmetic",
         "gapcert.contracts.systems.cells": "Cells",
         "gapcert.contracts.systems.domain": "Box Cover Domain Points",
         "gapcert.contracts.systems.extension": "Extension Memory Parameter",

@@ -96,6 +96,7 @@ from gapcert.contracts.plugins.presentation import view as view
 from gapcert.contracts.plugins.registry import Registry as Registry
 from gapcert.contracts.plugins.registry import hookimpl as hookimpl
 from gapcert.contracts.plugins.registry import registry as registry
+from gapcert.contracts.systems.arithmetic import Arithmetic as Arithmetic
 from gapcert.contracts.systems.cells import Cells as Cells
 from gapcert.contracts.systems.domain import Box as Box
 from gapcert.contracts.systems.domain import Cover as Cover

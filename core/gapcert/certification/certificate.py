@@ -352,7 +352,7 @@ class Certificate(Statement):
         arrays = {f"predictor.{k}": v for k, v in p.predictor.arrays().items()}
         arrays |= {"lipschitz": p.lipschitz.value, "resolution": p.resolution, "remainder.resolution": p.remainder_resolution}
         arrays |= {} if p.lipschitz.cells is None else p.lipschitz.cells.arrays()
-        arrays |= {} if p.rounding is None else {"rounding": p.rounding}
+        arrays |= {} if p.arithmetics is None else {"rounding": p.arithmetic}
         arrays |= {} if p.lipschitz.curvature is None else {"curvature": p.lipschitz.curvature}
         for j, slab in enumerate(p.lipschitz.slabs or ()):
             arrays |= {} if slab is None else {f"curvature.cuts{j}": slab[0], f"curvature.slabs{j}": slab[1]}
@@ -369,6 +369,7 @@ class Certificate(Statement):
             cover=list(p.samples.cover.counts) if p.samples.cover else None,
             seed=p.seed,
             digests=dict(self.digests),
+            arithmetic=None if p.arithmetics is None else [a.to_data() for a in p.arithmetics],
         )
 
 

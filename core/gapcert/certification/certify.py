@@ -33,6 +33,7 @@ from gapcert.contracts.gaps.lipschitz import LipschitzEstimator, LipschitzProble
 from gapcert.contracts.gaps.predictor import AffinePredictor, ModelPredictor, Predictor, Samples
 from gapcert.contracts.plugins.events import Emit, Event, Pulse, silent
 from gapcert.contracts.plugins.registry import registry
+from gapcert.contracts.systems.arithmetic import named
 from gapcert.contracts.systems.domain import Domain, Points
 from gapcert.contracts.systems.system import Model, System
 from gapcert.numerics.arrays import Array, Bools
@@ -141,8 +142,11 @@ def measure(question: Question, store: Store, gate: Gate) -> GapProblem:
     domain, sampling, seed, symmetries = question.domain, question.sampling, question.seed, question.symmetries
     residual = store.residual
     # |r(z, h) − r(z′, h′)| ≤ L |z − z′| + 2 (e + s): the spread s over hidden states acts as a further resolution.
-    rounding = residual.resolution(domain)
+    both = residual.arithmetic(domain)
+    rounding = both[0].e + both[1].e
     e = rounding + gate.bound
+    for message in named(*both, [s.name for s in residual.model.states]):
+        store.emit(Event("warning", "certificate", {"message": message}))
 
     def query(name: str, points: Array) -> Array:
         return store.collect(name, Points(points))
@@ -164,7 +168,7 @@ def measure(question: Question, store: Store, gate: Gate) -> GapProblem:
         further = constants.cells.points(domain, samples.r, (sampling.budget or 0) - len(samples))
     else:
         further = sampling.further(domain, samples.z, samples.r, constants.value, constants)
-    problem = GapProblem(samples, domain, constants, p, e, question.fit.name, seed, rounding=rounding, symmetry=symmetry)
+    problem = GapProblem(samples, domain, constants, p, e, question.fit.name, seed, symmetry, both)
     if further is not None:
         samples = refined(problem, further, sampling.tightness, query)
     if isinstance(sampling, LatticeSampling):

@@ -21,6 +21,7 @@ from gapcert.contracts.gaps.gap import GapFamily, GapFunction, GapProblem
 from gapcert.contracts.gaps.predictor import Samples
 from gapcert.contracts.plugins.events import Pulse
 from gapcert.contracts.plugins.registry import registry
+from gapcert.contracts.systems.arithmetic import sentence
 from gapcert.contracts.systems.domain import Domain
 from gapcert.contracts.systems.system import Model, System
 from gapcert.numerics.arrays import Array, Ints
@@ -222,11 +223,10 @@ def _envelope(gap: GapFunction, problem: GapProblem) -> GapFunction:
 def _assumptions(basis: Sequence[str], problem: GapProblem, audited: Audit, model: Model, gate: Gate) -> list[str]:
     """What the claim rests on, one sentence each, with provenance; `basis` is what γ itself does."""
     names = [s.name for s in model.states]
+    assert problem.arithmetics is not None, "certify looks at both"
     return [
         *basis,
-        "One step of f̂ and of f, as computed, is within e of its exact value: "
-        + ", ".join(f"e({n}) = {e:.2g}" for n, e in zip(names, problem.arithmetic, strict=True))
-        + ".",
+        sentence(*problem.arithmetics, names),
         f"f̂ is a function of its arguments alone: {gate.purity}; this was probed, not proved.",
         *gate.sentences(),
         *([problem.symmetry.sentence()] if problem.symmetry is not None else []),

@@ -145,6 +145,13 @@ class AugmentedModel(Model):
         """h⁺ = h is exact."""
         return np.concatenate([self.model.resolution(magnitude[: self.model.nx]), np.zeros(len(self.added))])
 
+    def rounding_over(self, z: Interval) -> Array | None:
+        inner = self.model.rounding_over(self._inner(z))
+        return None if inner is None else np.hstack([inner, np.zeros((len(z), len(self.added)))])
+
+    def rounding_terms(self, z: Interval) -> tuple[str, ...]:
+        return self.model.rounding_terms(self._inner(z)) + ("",) * len(self.added)
+
     def digest(self) -> str:
         return json_digest(type(self).__qualname__, self.model.digest(), [[s.name, s.unit, s.kind] for s in self.added])
 
@@ -206,6 +213,12 @@ class Resting(Model):
 
     def resolution(self, magnitude: Array) -> Array:
         return self.model.resolution(magnitude)
+
+    def rounding_over(self, z: Interval) -> Array | None:
+        return self.model.rounding_over(z)
+
+    def rounding_terms(self, z: Interval) -> tuple[str, ...]:
+        return self.model.rounding_terms(z)
 
     def digest(self) -> str:
         return json_digest(type(self).__qualname__, self.model.digest())

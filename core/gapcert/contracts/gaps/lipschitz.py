@@ -10,6 +10,7 @@ from typing import Any, Literal, final
 import numpy as np
 
 from gapcert.contracts.gaps.predictor import Predictor
+from gapcert.contracts.systems.arithmetic import Arithmetic
 from gapcert.contracts.systems.cells import Cells
 from gapcert.contracts.systems.domain import Domain
 from gapcert.contracts.systems.system import Backend, Model, StateSpec, System, difference
@@ -39,15 +40,12 @@ class Residual:
         return difference(self.model.states, self.backend.step(x, u).x, self.model.step(x, u).x)
 
     def resolution(self, domain: Domain) -> Array:
-        """e (nx,): bound on |computed r − r|, from both arithmetics at the largest |x⁺| of each on Z's corners and centre.
+        """e (nx,): bound on |computed r − r| over Z, from both arithmetics."""
+        return np.asarray(sum(a.e for a in self.arithmetic(domain)))
 
-        Where relations cut a corner off, the last point of Z on the way to it stands in.
-        """
-        corners = np.stack(np.meshgrid(*zip(domain.low, (domain.low + domain.high) / 2, domain.high, strict=True)), axis=-1)
-        z = domain.reach(domain.centre, corners.reshape(-1, len(domain.low)))
-        x, u = domain.split(z)
-        each = (s.resolution(np.abs(s.step(x, u).x).max(axis=0)) for s in (self.backend, self.model))
-        return np.asarray(sum(each))
+    def arithmetic(self, domain: Domain) -> tuple[Arithmetic, Arithmetic]:
+        """Those of f̂ and of f on Z."""
+        return Arithmetic.of(self.backend, domain), Arithmetic.of(self.model, domain)
 
 
 @final

@@ -123,7 +123,10 @@ class System(ABC):
         """One period from x (n, nx) under u (n, nu); options only as declared in `capabilities`."""
 
     def resolution(self, magnitude: Array) -> Array:
-        """e (nx,): bound on the arithmetic error of one step, by default 4 ulp of `magnitude` = max |x⁺| (nx,)."""
+        """e (nx,): bound on the arithmetic error of one step, by default 4 ulp of `magnitude` = max |x⁺| (nx,).
+
+        It is stated, not proved: claims name it as an assumption. For a Model, see `rounding_over`.
+        """
         return np.asarray(4 * np.spacing(np.maximum(np.abs(magnitude), np.finfo(float).tiny)))
 
     def rounding(self, magnitude: Array) -> Array:
@@ -391,6 +394,15 @@ class Model(System, Extendable, EngineHints):
     def curvature_enclosure(self, z: Interval, axis: int) -> Interval:
         """Contains {∂²f/∂z_axis² : z ∈ box}, shape (n, nx), rounded outwards; [−∞, ∞] where a slope may jump, or by default."""
         return Interval(np.full((len(z), self.nx), -np.inf), np.full((len(z), self.nx), np.inf))
+
+    def rounding_over(self, z: Interval) -> Array | None:
+        """(n, nx): proved bound on |computed x⁺ − x⁺| over each box, intermediate results included, whatever evaluates the
+        step and in whatever batch; ∞ where nothing bounds it. None (default): `resolution` is what is assumed."""
+        return None
+
+    def rounding_terms(self, z: Interval) -> tuple[str, ...]:
+        """Per state, the term whose rounding has the largest share in that bound, over all of the boxes."""
+        return ("",) * self.nx
 
     def output(self, x: Array, u: Array, parameters: Values | None = None) -> Array:
         """y = h(x, u), shape (n, ny); by default the state itself."""

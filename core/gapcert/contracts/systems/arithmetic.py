@@ -1,0 +1,106 @@
+"""How far computed steps may be from exact ones on Z: proved over a cover where there is text, else as the System states it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+
+from gapcert.contracts.systems.domain import Domain
+from gapcert.contracts.systems.system import Model, System
+from gapcert.contracts.thresholds import THRESHOLDS
+from gapcert.numerics.arrays import Array
+from gapcert.numerics.intervals import Interval
+
+
+@final
+@dataclass(frozen=True)
+class Arithmetic:
+    """e (nx,) of one System on Z, see `Model.rounding_over`; `proved`, or an assumption.
+
+    terms: per state the term whose rounding has the largest share, empty where e is as small as the state's own last digits.
+    """
+
+    e: Array
+    proved: bool = False
+    terms: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, system: System, domain: Domain) -> Arithmetic:
+        """By the proof of a Model where there is one; else what the System states at the largest |x⁺| on Z's corners and centre,
+        and for a Model no less than what is proved at points of Z.
+        """
+        if not isinstance(system, Model) or (found := _covered(system, domain)) is None:
+            return cls(system.resolution(_largest(system, domain)))
+        boxes, bound, least = found
+        size = system.enclosure(boxes).mag.max(axis=0)
+        # f̂ − f, whole turns of it, and r − p round in turn, by u = eps / 2 of |f̂| + |f| or of that and a few turns.
+        e = bound.max(axis=0) + 2 * np.finfo(float).eps * size
+        if not np.isfinite(e).all():
+            stated = system.resolution(_largest(system, domain))
+            return cls(np.maximum(stated, np.where(np.isfinite(least), 2 * least, 0.0)))
+        plain = e <= THRESHOLDS.rounding_plain * system.resolution(size)
+        worst = system.rounding_terms(boxes[(bound / e).max(axis=1).argmax()][None])
+        return cls(e, True, tuple("" if small else term for small, term in zip(plain, worst, strict=True)))
+
+    def to_data(self) -> dict[str, Any]:
+        """JSON-able."""
+        return {"e": self.e.tolist(), "proved": self.proved, "terms": list(self.terms)}
+
+
+def sentence(backend: Arithmetic, model: Arithmetic, names: Sequence[str]) -> str:
+    """What both are within, and what of that is proved."""
+    proved, stated = "is proved by a running error analysis of its equations", "is assumed as it is stated, not proved"
+    each = ", ".join(f"e({n}) = {e:.2g}" for n, e in zip(names, backend.e + model.e, strict=True))
+    how = " and ".join(f"that of {of} {proved if a.proved else stated}" for of, a in (("f̂", backend), ("f", model)))
+    one = f"One step of f̂ and of f, as computed, is within e of its exact value: {each}; {how}."
+    return " ".join([one, *named(backend, model, names)])
+
+
+def named(backend: Arithmetic, model: Arithmetic, names: Sequence[str]) -> list[str]:
+    """Terms with which text cancels badly."""
+    return [
+        f"Most of e({n}) is the rounding of {term} in {of}."
+        for of, a in (("f̂", backend), ("f", model))
+        for n, term in zip(names, a.terms, strict=False)
+        if term
+    ]
+
+
+def _largest(system: System, domain: Domain) -> Array:
+    """Max |x⁺| (nx,) on Z's corners and centre. Where relations cut a corner off, the last point of Z on the way stands in."""
+    corners = np.stack(np.meshgrid(*zip(domain.low, (domain.low + domain.high) / 2, domain.high, strict=True)), axis=-1)
+    x, u = domain.split(domain.reach(domain.centre, corners.reshape(-1, len(domain.low))))
+    return np.asarray(np.abs(system.step(x, u).x).max(axis=0))
+
+
+def _covered(model: Model, domain: Domain) -> tuple[Interval, Array, Array] | None:
+    """(boxes that cover Z, bounds over each (n, nx), the largest of those at points of Z (nx,)), or None.
+
+    Boxes are cut across their widest axis while a bound is well above those at points.
+    """
+    boxes, rng = domain.interval, np.random.default_rng(0)
+    if (bound := model.rounding_over(boxes)) is None:
+        return None
+    ends = np.where(rng.random((THRESHOLDS.rounding_points, len(domain.low))) < 0.5, domain.low, domain.high)
+    points = np.concatenate([domain.reach(domain.centre, ends), domain.draw(THRESHOLDS.rounding_points, rng)])
+    least = _at(model, Interval.exact(points)).max(axis=0)
+    width = np.maximum(domain.width, np.finfo(float).tiny)
+    while True:
+        over = (bound / np.maximum(least, np.finfo(float).tiny)).max(axis=1)
+        most = THRESHOLDS.rounding_boxes * (1 if over.max() < THRESHOLDS.rounding_wide else 8)
+        urgent = np.flatnonzero(~(over <= 2))[: max(0, most - len(boxes))]
+        if not len(urgent):
+            return boxes, bound, least
+        parts = boxes[urgent].cut(((boxes.hi - boxes.lo)[urgent] / width).argmax(axis=1))
+        parts = parts[~domain.outside(parts)]
+        kept = np.delete(np.arange(len(boxes)), urgent)
+        boxes, bound = Interval.concatenate([boxes[kept], parts]), np.concatenate([bound[kept], _at(model, parts)])
+
+
+def _at(model: Model, boxes: Interval) -> Array:
+    found = model.rounding_over(boxes)
+    assert found is not None, "it is known of all boxes or of none"
+    return found
