@@ -163,7 +163,9 @@ def _number(p: Any, q: Any) -> Rounded:
     """p / q, whose whole numbers may not be floats themselves."""
     if q == 1 and float(p) == p:
         return Rounded.exact(p, f"{p}")
-    return _made(Interval.exact(p) / Interval.exact(q), (_U if max(abs(p), q) <= 2**53 else 4 * _U), f"{p}/{q}".removesuffix("/1"))
+    return _made(
+        Interval.exact(p) / Interval.exact(q), (_U if max(abs(p), q) <= 2**53 else 4 * _U), f"{p}/{q}".removesuffix("/1")
+    )
 
 
 def _function(name: str) -> Callable[[Any], Rounded]:

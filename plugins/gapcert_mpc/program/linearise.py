@@ -108,9 +108,8 @@ class Nominal:
         """(nx,): by how much a computed step of f may differ from f in a box."""
         key = low.tobytes() + high.tobytes()
         if key not in self._missed:
-            split = ((low[: self.nx], high[: self.nx]), (low[self.nx :], high[self.nx :]))
-            axes = (self.model.states, self.model.inputs)
-            x, u = (Box(a, tuple(l.tolist()), tuple(h.tolist())) for a, (l, h) in zip(axes, split, strict=True))
+            parts = (self.model.states, slice(None, self.nx)), (self.model.inputs, slice(self.nx, None))
+            x, u = (Box(axes, tuple(low[part].tolist()), tuple(high[part].tolist())) for axes, part in parts)
             self._missed[key] = Arithmetic.of(self.model, Domain(x, u)).e
         return self._missed[key]
 
@@ -241,7 +240,7 @@ class Nominal:
         return in_frame(frame, J, self._at(at, frame)[0], c, np.zeros_like(J), z, low, high)
 
     def _at(self, z: Array, frame: Frame) -> tuple[Array, Array]:
-        """F(z) at points of the frame, but for whole turns of angles, and what that and a step may be wrong by: (k, nx) each."""
+        """F(z) at points of the frame, but for whole turns of angles, and by how much it may be wrong: (k, nx) each."""
         x, u = z[:, : self.nx], z[:, self.nx :]
         after = self.model.step(x, u).x
         for j, axis in enumerate(self.model.states):
