@@ -1,9 +1,9 @@
 """What floating-point arithmetic may miss: a running error analysis along the operations of a tape, over boxes.
 
-A computed number is the exact one plus at most `error`: every operation hands on what its operands may be wrong by, and adds its
-own rounding, u |result| with u = 2⁻⁵³ (Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., section 3.3). It holds
-for NumPy, for the compiled interpreter and for JAX: a fused multiply-add rounds once where two roundings are counted, a division
-may be a product with a reciprocal, and the functions of each of them err by at most 4 ulp.
+A computed number differs from the exact one by at most `error`: every operation hands on what its operands may be wrong by, and
+adds its own rounding, u |result| with u = 2⁻⁵³ (Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., section 3.3).
+It holds for NumPy, for the compiled interpreter and for JAX: a fused multiply-add rounds once where two roundings are counted, a
+division may be a product with a reciprocal, and the functions of each of them err by at most 4 ulp.
 """
 
 from __future__ import annotations
@@ -163,9 +163,8 @@ def _number(p: Any, q: Any) -> Rounded:
     """p / q, whose whole numbers may not be floats themselves."""
     if q == 1 and float(p) == p:
         return Rounded.exact(p, f"{p}")
-    return _made(
-        Interval.exact(p) / Interval.exact(q), (_U if max(abs(p), q) <= 2**53 else 4 * _U), f"{p}/{q}".removesuffix("/1")
-    )
+    exact = max(abs(p), q) <= 2**53
+    return _made(Interval.exact(p) / Interval.exact(q), _U if exact else 4 * _U, f"{p}/{q}")
 
 
 def _function(name: str) -> Callable[[Any], Rounded]:
