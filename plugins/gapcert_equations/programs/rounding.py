@@ -1,8 +1,8 @@
 """What floating-point arithmetic may miss: a running error analysis along the operations of a tape, over boxes.
 
-A computed number differs from the exact one by at most `error`: every operation hands on what its operands may be wrong by, and
-adds its own rounding, u |result| with u = 2⁻⁵³ (Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., section 3.3).
-It holds for NumPy, for the compiled interpreter and for JAX: a fused multiply-add rounds once where two roundings are counted, a
+A computed number differs from the exact one by at most `error`: every operation hands on what its operands may be wrong by,
+and adds its own rounding, u |result| with u = 2⁻⁵³ (Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., 3.3). It
+holds for NumPy, for the compiled interpreter and for JAX: a fused multiply-add rounds once where two roundings are counted, a
 division may be a product with a reciprocal, and the functions of each of them err by at most 4 ulp.
 """
 

@@ -109,9 +109,9 @@ class GapFunction(ABC):
 @final
 @dataclass(frozen=True)
 class GapProblem:
-    """What a family is fitted to. `lipschitz` bounds g = r − p; `resolution` is e (nx,), of which `arithmetics`, of f̂ and f, are
-    the part of arithmetic where the rest is the spread over hidden states. `emit` takes the progress of a long fit, and `folder`
-    what it may be resumed from.
+    """What a family is fitted to. `lipschitz` bounds g = r − p; `resolution` is e (nx,), of which `arithmetics`, of f̂ and f,
+    are the part of arithmetic where the rest is the spread over hidden states. `emit` takes the progress of a long fit, and
+    `folder` what it may be resumed from.
     """
 
     samples: Samples

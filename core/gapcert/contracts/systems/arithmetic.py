@@ -29,8 +29,8 @@ class Arithmetic:
 
     @classmethod
     def of(cls, system: System, domain: Domain) -> Arithmetic:
-        """By a Model's proof, where there is one; else what the System states at the largest |x⁺| on Z's corners and centre, and
-        for a Model no less than what is proved at points of Z.
+        """By a Model's proof, where there is one; else what the System states at the largest |x⁺| on Z's corners and centre,
+        and for a Model no less than what is proved at points of Z.
         """
         if not isinstance(system, Model) or (found := _covered(system, domain)) is None:
             return cls(system.resolution(_largest(system, domain)))
