@@ -57,7 +57,7 @@ def test_points_next_to_samples_stay_in_the_band(tmp_path, name):
     assert outside(c, near(c, 20_000), TEXTS[name][0]) == 0
     assert outside(c, c.domain.draw(20_000, np.random.default_rng(4)), TEXTS[name][0]) == 0
     said = next(a for a in c.assumptions if "within e" in a)
-    assert said.count("is proved by a running error analysis") == 2
+    assert "of both it is proved by a running error analysis" in said
     assert "Most of e(p) is the rounding of" in said
 
 
@@ -66,8 +66,8 @@ def test_with_four_ulp_of_the_state_they_do_not(tmp_path, monkeypatch, name):
     """And then e is told as an assumption."""
     monkeypatch.setattr(EquationsModel, "rounding_over", lambda self, z: None)
     c = certified(tmp_path, name)
-    assert outside(c, near(c, 20_000), TEXTS[name][0]) > 1000
-    assert sum("is assumed as it is stated, not proved" in a for a in c.assumptions) == 1
+    assert outside(c, near(c, 20_000), TEXTS[name][0]) > 100
+    assert sum("of both it is assumed as it is stated, not proved" in a for a in c.assumptions) == 1
 
 
 @pytest.mark.contract
@@ -78,7 +78,7 @@ def test_other_families_and_the_verifier_agree(tmp_path, family):
     c = certified(tmp_path, "offset", family=made, **({"predictor": None} | more if made.lattice else {}))
     assert outside(c, near(c, 20_000), TEXTS["offset"][0]) == 0
     c.save(tmp_path / "run")
-    assert all(check.passed for check in verify_run(tmp_path / "run").checks)
+    assert [check for check in verify_run(tmp_path / "run")["checks"] if not check["passed"]] == []
 
 
 @pytest.mark.exam

@@ -35,13 +35,13 @@ class Arithmetic:
         if not isinstance(system, Model) or (found := _covered(system, domain)) is None:
             return cls(system.resolution(_largest(system, domain)))
         boxes, bound, least = found
-        size = system.enclosure(boxes).mag.max(axis=0)
         # f̂ − f, whole turns of it, and r − p round in turn, by u = eps / 2 of |f̂| + |f| or of that and a few turns.
-        e = bound.max(axis=0) + 2 * np.finfo(float).eps * size
+        e = bound.max(axis=0) + 2 * np.finfo(float).eps * system.enclosure(boxes).mag.max(axis=0)
         if not np.isfinite(e).all():
             stated = system.resolution(_largest(system, domain))
             return cls(np.maximum(stated, np.where(np.isfinite(least), 2 * least, 0.0)))
-        plain = e <= THRESHOLDS.rounding_plain * system.resolution(size)
+        x, u = domain.split(_points(domain))
+        plain = e <= THRESHOLDS.rounding_plain * system.resolution(np.abs(system.step(x, u).x).max(axis=0))
         worst = system.rounding_terms(boxes[(bound / e).max(axis=1).argmax()][None])
         return cls(e, True, tuple("" if small else term for small, term in zip(plain, worst, strict=True)))
 
@@ -52,9 +52,10 @@ class Arithmetic:
 
 def sentence(backend: Arithmetic, model: Arithmetic, names: Sequence[str]) -> str:
     """What both are within, and what of that is proved."""
-    proved, stated = "is proved by a running error analysis of its equations", "is assumed as it is stated, not proved"
+    proved, stated = "is proved by a running error analysis of the equations", "is assumed as it is stated, not proved"
     each = ", ".join(f"e({n}) = {e:.2g}" for n, e in zip(names, backend.e + model.e, strict=True))
-    how = " and ".join(f"that of {of} {proved if a.proved else stated}" for of, a in (("f̂", backend), ("f", model)))
+    each_how = [proved if a.proved else stated for a in (backend, model)]
+    how = f"of both it {each_how[0]}" if len({*each_how}) == 1 else "of f̂ it {}, and of f it {}".format(*each_how)
     one = f"One step of f̂ and of f, as computed, is within e of its exact value: {each}; {how}."
     return " ".join([one, *named(backend, model, names)])
 
@@ -81,12 +82,10 @@ def _covered(model: Model, domain: Domain) -> tuple[Interval, Array, Array] | No
 
     Boxes are cut across their widest axis while a bound is well above those at points.
     """
-    boxes, rng = domain.interval, np.random.default_rng(0)
+    boxes = domain.interval
     if (bound := model.rounding_over(boxes)) is None:
         return None
-    ends = np.where(rng.random((THRESHOLDS.rounding_points, len(domain.low))) < 0.5, domain.low, domain.high)
-    points = np.concatenate([domain.reach(domain.centre, ends), domain.draw(THRESHOLDS.rounding_points, rng)])
-    least = _at(model, Interval.exact(points)).max(axis=0)
+    least = _at(model, Interval.exact(_points(domain))).max(axis=0)
     width = np.maximum(domain.width, np.finfo(float).tiny)
     while True:
         over = (bound / np.maximum(least, np.finfo(float).tiny)).max(axis=1)
@@ -98,6 +97,13 @@ def _covered(model: Model, domain: Domain) -> tuple[Interval, Array, Array] | No
         parts = parts[~domain.outside(parts)]
         kept = np.delete(np.arange(len(boxes)), urgent)
         boxes, bound = Interval.concatenate([boxes[kept], parts]), np.concatenate([bound[kept], _at(model, parts)])
+
+
+def _points(domain: Domain) -> Array:
+    """Corners of Z, or what relations leave of the way there, and points inside."""
+    rng, n = np.random.default_rng(0), THRESHOLDS.rounding_points
+    ends = np.where(rng.random((n, len(domain.low))) < 0.5, domain.low, domain.high)
+    return np.concatenate([domain.reach(domain.centre, ends), domain.draw(n, rng)])
 
 
 def _at(model: Model, boxes: Interval) -> Array:
