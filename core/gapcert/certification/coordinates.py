@@ -221,9 +221,6 @@ class RelativeModel(_Relative, Model):
             return None
         return np.asarray(own + (self.inner.jacobian_enclosure(near).mag @ missed[..., None])[..., 0])
 
-    def rounding_terms(self, z: Interval) -> tuple[str, ...]:
-        return self.inner.rounding_terms(self.relative.inputs_over(z))
-
     def output(self, x: Array, u: Array, parameters: Mapping[str, Array | float] | None = None) -> Array:
         return self.inner.output(x, self.relative.inputs(x, u), parameters)
 

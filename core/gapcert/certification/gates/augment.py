@@ -149,9 +149,6 @@ class AugmentedModel(Model):
         inner = self.model.rounding_over(self._inner(z))
         return None if inner is None else np.hstack([inner, np.zeros((len(z), len(self.added)))])
 
-    def rounding_terms(self, z: Interval) -> tuple[str, ...]:
-        return self.model.rounding_terms(self._inner(z)) + ("",) * len(self.added)
-
     def digest(self) -> str:
         return json_digest(type(self).__qualname__, self.model.digest(), [[s.name, s.unit, s.kind] for s in self.added])
 

@@ -32,17 +32,19 @@ class Arithmetic:
         """By a Model's proof, where there is one; else what the System states at the largest |x⁺| on Z's corners and centre,
         and for a Model no less than what is proved at points of Z.
         """
-        if not isinstance(system, Model) or (found := _covered(system, domain)) is None:
+        if not isinstance(system, Model) or (bound := system.rounding_over(domain.interval)) is None:
             return cls(system.resolution(_largest(system, domain)))
-        boxes, bound, least = found
+        boxes, points = domain.interval, _points(domain)
+        if (bound > system.resolution(system.enclosure(boxes).mag[0]) / 2).any():
+            boxes, bound, least = _covered(system, domain, bound, points)
+            if not np.isfinite(bound).all():
+                stated = system.resolution(_largest(system, domain))
+                return cls(np.maximum(stated, np.where(np.isfinite(least), 2 * least, 0.0)))
         # f̂ − f, whole turns of it, and r − p round in turn, by u = eps / 2 of |f̂| + |f| or of that and a few turns.
         e = bound.max(axis=0) + 2 * np.finfo(float).eps * system.enclosure(boxes).mag.max(axis=0)
-        if not np.isfinite(e).all():
-            stated = system.resolution(_largest(system, domain))
-            return cls(np.maximum(stated, np.where(np.isfinite(least), 2 * least, 0.0)))
-        x, u = domain.split(_points(domain))
+        x, u = domain.split(points)
         plain = e <= THRESHOLDS.rounding_plain * system.resolution(np.abs(system.step(x, u).x).max(axis=0))
-        worst = system.rounding_terms(boxes[(bound / e).max(axis=1).argmax()][None])
+        worst = ("",) * len(e) if plain.all() else system.rounding_terms(boxes[(bound / e).max(axis=1).argmax()][None])
         return cls(e, True, tuple("" if small else term for small, term in zip(plain, worst, strict=True)))
 
     def to_data(self) -> dict[str, Any]:
@@ -77,16 +79,13 @@ def _largest(system: System, domain: Domain) -> Array:
     return np.asarray(np.abs(system.step(x, u).x).max(axis=0))
 
 
-def _covered(model: Model, domain: Domain) -> tuple[Interval, Array, Array] | None:
-    """(boxes that cover Z, bounds over each (n, nx), the largest of those at points of Z (nx,)), or None.
+def _covered(model: Model, domain: Domain, bound: Array, points: Array) -> tuple[Interval, Array, Array]:
+    """(boxes that cover Z, bounds over each (n, nx), the largest of those at points of Z (nx,)), from `bound` over Z's box.
 
     Boxes are cut across their widest axis while a bound is well above those at points.
     """
-    boxes = domain.interval
-    if (bound := model.rounding_over(boxes)) is None:
-        return None
-    least = _at(model, Interval.exact(_points(domain))).max(axis=0)
-    width = np.maximum(domain.width, np.finfo(float).tiny)
+    boxes, width = domain.interval, np.maximum(domain.width, np.finfo(float).tiny)
+    least = np.asarray(model.rounding_over(Interval.exact(points))).max(axis=0)
     while True:
         over = (bound / np.maximum(least, np.finfo(float).tiny)).max(axis=1)
         most = THRESHOLDS.rounding_boxes * (1 if over.max() < THRESHOLDS.rounding_wide else 8)
@@ -95,8 +94,8 @@ def _covered(model: Model, domain: Domain) -> tuple[Interval, Array, Array] | No
             return boxes, bound, least
         parts = boxes[urgent].cut(((boxes.hi - boxes.lo)[urgent] / width).argmax(axis=1))
         parts = parts[~domain.outside(parts)]
-        kept = np.delete(np.arange(len(boxes)), urgent)
-        boxes, bound = Interval.concatenate([boxes[kept], parts]), np.concatenate([bound[kept], _at(model, parts)])
+        kept, finer = np.delete(np.arange(len(boxes)), urgent), np.asarray(model.rounding_over(parts))
+        boxes, bound = Interval.concatenate([boxes[kept], parts]), np.concatenate([bound[kept], finer])
 
 
 def _points(domain: Domain) -> Array:
@@ -104,9 +103,3 @@ def _points(domain: Domain) -> Array:
     rng, n = np.random.default_rng(0), THRESHOLDS.rounding_points
     ends = np.where(rng.random((n, len(domain.low))) < 0.5, domain.low, domain.high)
     return np.concatenate([domain.reach(domain.centre, ends), domain.draw(n, rng)])
-
-
-def _at(model: Model, boxes: Interval) -> Array:
-    found = model.rounding_over(boxes)
-    assert found is not None, "it is known of all boxes or of none"
-    return found
