@@ -40,17 +40,18 @@ _HOME = homes(
         "gapcert.contracts.plugins.registry": "Registry hookimpl registry",
         "gapcert.contracts.systems.arithmetic": "Arithmetic",
         "gapcert.contracts.systems.cells": "Cells",
-        "gapcert.contracts.systems.domain": "Box Cover Domain Points",
+        "gapcert.contracts.systems.domain": "Box Cover Domain Points turned",
         "gapcert.contracts.systems.extension": "Extension Memory Parameter",
-        "gapcert.contracts.systems.region": "TURN Ellipsoid Polytope Region turned",
+        "gapcert.contracts.systems.region": "Ellipsoid Polytope Region",
         "gapcert.contracts.systems.scene": "GREY Scene Shape at_rest",
         "gapcert.contracts.systems.system": (
             "Backend Capability EngineHints Extendable Model StateSpec Step System Values Variant cross difference rotated "
             "step_seed"
         ),
         "gapcert.lazy": "LazyPackage homes",
-        "gapcert.numerics": "order_statistics",
+        "gapcert.numerics": "circle order_statistics",
         "gapcert.numerics.arrays": "Array Bools Ints",
+        "gapcert.numerics.circle": "TURN",
         "gapcert.numerics.atomic_files": "DAMAGE damage_told npz_bytes write_atomic",
         "gapcert.numerics.constraint_zone": "Relation Zone grid_at grid_size lattice",
         "gapcert.numerics.counter_rng": "keys normals uniforms",

@@ -102,14 +102,13 @@ from gapcert.contracts.systems.domain import Box as Box
 from gapcert.contracts.systems.domain import Cover as Cover
 from gapcert.contracts.systems.domain import Domain as Domain
 from gapcert.contracts.systems.domain import Points as Points
+from gapcert.contracts.systems.domain import turned as turned
 from gapcert.contracts.systems.extension import Extension as Extension
 from gapcert.contracts.systems.extension import Memory as Memory
 from gapcert.contracts.systems.extension import Parameter as Parameter
-from gapcert.contracts.systems.region import TURN as TURN
 from gapcert.contracts.systems.region import Ellipsoid as Ellipsoid
 from gapcert.contracts.systems.region import Polytope as Polytope
 from gapcert.contracts.systems.region import Region as Region
-from gapcert.contracts.systems.region import turned as turned
 from gapcert.contracts.systems.scene import GREY as GREY
 from gapcert.contracts.systems.scene import Scene as Scene
 from gapcert.contracts.systems.scene import Shape as Shape
@@ -130,6 +129,7 @@ from gapcert.contracts.systems.system import rotated as rotated
 from gapcert.contracts.systems.system import step_seed as step_seed
 from gapcert.lazy import LazyPackage as LazyPackage
 from gapcert.lazy import homes as homes
+from gapcert.numerics import circle as circle
 from gapcert.numerics import order_statistics as order_statistics
 from gapcert.numerics.arrays import Array as Array
 from gapcert.numerics.arrays import Bools as Bools
@@ -138,6 +138,7 @@ from gapcert.numerics.atomic_files import DAMAGE as DAMAGE
 from gapcert.numerics.atomic_files import damage_told as damage_told
 from gapcert.numerics.atomic_files import npz_bytes as npz_bytes
 from gapcert.numerics.atomic_files import write_atomic as write_atomic
+from gapcert.numerics.circle import TURN as TURN
 from gapcert.numerics.constraint_zone import Relation as Relation
 from gapcert.numerics.constraint_zone import Zone as Zone
 from gapcert.numerics.constraint_zone import grid_at as grid_at

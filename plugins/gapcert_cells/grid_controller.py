@@ -26,6 +26,7 @@ from gapcert.plugin import (
     Ints,
     Policy,
     UsageError,
+    circle,
     known,
     turned,
 )
@@ -228,9 +229,7 @@ class GridController(Controller):
     def wraps(self) -> tuple[bool, ...]:
         """Axes of cells that close on themselves: angles over a full turn."""
         kinds = [self.goal.stay.axes[j].kind for j in self.on]
-        return tuple(
-            kind == "angle" and (e[-1] - e[0]) * (1 + 1e-15) >= TURN for kind, e in zip(kinds, self.edges, strict=True)
-        )
+        return tuple(kind == "angle" and circle.spans(e[0], e[-1]) for kind, e in zip(kinds, self.edges, strict=True))
 
     def kept(self, x: Array, u: Array, after: Array, memory: Ints | None = None) -> Bools:
         """(n,): is `after` in a cell of the domain, of smaller value on the way to a target, and in one that was promised?

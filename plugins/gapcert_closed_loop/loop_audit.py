@@ -10,7 +10,7 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.plugin import Array, Bools, Claim, GapFunction, Model, difference, missed
+from gapcert.plugin import Array, Bools, Box, Claim, GapFunction, Model, difference, missed, turned
 
 STEPS = 2000
 """Steps of a policy that are held against [l, u] where none broke its promise: evaluating a gap may be dear."""
@@ -20,15 +20,16 @@ STARTS = "starts drawn uniformly where both controllers win, the target left out
 @final
 @dataclass(frozen=True)
 class Oracle:
-    """What a step was promised from: x⁺ ∈ f(x, u) + [l, u](x, u)."""
+    """What a step was promised from: x⁺ ∈ f(x, u) + [l, u](x, u), with angles on the turn of `states`, where the gap is known."""
 
     model: Model
     gap: GapFunction
+    states: Box | None = None
 
     def outside(self, x: Array, u: Array, after: Array) -> Bools:
         """(n,): the residual of a step that ended in `after` is outside [l, u], or no number: γ is refuted there."""
         r = difference(self.model.states, after, self.model.step(x, u).x)
-        low, high = self.gap.interval(np.hstack([x, u]))
+        low, high = self.gap.interval(np.hstack([x if self.states is None else turned(self.states, x), u]))
         # Asked so that NaN is outside.
         return np.asarray(~((r >= low) & (r <= high)).all(axis=1))
 

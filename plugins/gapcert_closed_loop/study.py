@@ -45,7 +45,7 @@ def _close(build: Build, asked: ClosedLoopConfig, stages: Stages, made: Any) -> 
             seed=build.spec.config.seed if asked.seed is None else asked.seed,
             law=None if certificate.gate is None else certificate.gate.law,
             domain=made["domain"],
-            oracle=Oracle(model, build.absolute(certificate.gap, model)),
+            oracle=Oracle(model, build.absolute(certificate.gap, model), made["domain"].states),
             beta=beta_of(asked.confidence),
             emit=stages.emit,
         )

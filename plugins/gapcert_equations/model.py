@@ -197,6 +197,16 @@ class EquationsModel(Model):
             row[:] = [a is b for a, b in zip(after, x, strict=True)]
         return found[which.reshape(-1)]
 
+    def repeats(self, angle: str) -> str:
+        """By what a turn does to each operation of the step, through the integrator, to x⁺ and to what is remembered."""
+        from .programs.winding import WINDING, Winding, unrepeated
+
+        x = [Winding(float(s.name == angle)) for s in self.states]
+        past = [Winding() for _ in self.hidden] if self.hidden else None
+        new, kept = self._columns(WINDING, self._stated, x, [Winding() for _ in self.inputs], past)
+        after = zip((*self.states, *self.hidden), [*new, *(kept or [])], strict=True)
+        return next((why for spec, value in after if (why := unrepeated(spec, value, angle))), "")
+
     def curvature_enclosure(self, z: Interval, axis: int) -> Interval:
         """Derivatives of second order in interval arithmetic; the whole line where a box may hold a kink."""
         if self.definition.dynamics.coupled_friction:

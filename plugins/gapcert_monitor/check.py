@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array, Interval, Model, Recording, Trajectory, UsageError
-from gapcert.plugin import Coordinates, RelativeModel, Zone, damage_told, difference, magnitude, stated_units, without_units
+from gapcert.plugin import Coordinates, RelativeModel, Zone, circle, damage_told, difference, magnitude, stated_units, without_units
 from gapcert_monitor.thresholds import THRESHOLDS
 from gapcert_recordings import Transitions, axes
 from gapcert_verify import Evidence, bounds, load, zone
@@ -88,14 +88,11 @@ class Certified:
         return cls(model, zone(evidence.data), _stored_band(evidence, p), relative)
 
     def points(self, x: Array, u: Array) -> Array:
-        """z (n, nz) in the coordinates of Z; angles on the turn that is nearest to the middle of Z."""
+        """z (n, nz) in the coordinates of Z; angles on the turn of Z."""
         z = np.hstack([x, u])
         for j, axis in enumerate(self.model.states):
             if axis.kind == "angle":
-                middle = (self.zone.low[j] + self.zone.high[j]) / 2
-                turns = np.round((z[:, j] - middle) / (2 * np.pi))
-                # A whole turn is subtracted only where there is one: it is rounded.
-                z[:, j] = np.where(turns != 0, z[:, j] - 2 * np.pi * turns, z[:, j])
+                z[:, j] = circle.onto(self.zone.low[j], self.zone.high[j], z[:, j])
         return z if self.relative is None else self.relative.over(Interval.exact(z)).mid
 
     def residual(self, x: Array, u: Array, x_next: Array) -> Array:

@@ -13,7 +13,7 @@ from typing import Any, Generic, Protocol, TypeVar, final
 
 import numpy as np
 
-from gapcert.plugin import Array, Bools, Controller, Event, Goal, Ints, Policy, Pulse, UsageError
+from gapcert.plugin import Array, Bools, Controller, Event, Goal, Ints, Policy, Pulse, UsageError, circle
 from gapcert_cells import loaded, write_saved
 
 from .planning.arrival import Arrival
@@ -83,19 +83,14 @@ class PlanController(Controller, Generic[R]):
         return ("first",)
 
     @cached_property
-    def _turns(self) -> Array | None:
-        """2π for angles, and infinity for what never comes back; None where nothing does."""
-        turns = np.array([2 * np.pi if axis.kind == "angle" else np.inf for axis in self.goal.stay.axes])
-        return turns if np.isfinite(turns).any() else None
+    def _angles(self) -> Bools:
+        return np.array([axis.kind == "angle" for axis in self.goal.stay.axes])
 
     def framed(self, x: Array) -> Array:
         """States (n, nx) in the frame; angles by the turn that is nearest to its middle."""
         middle, half = self._design.frame.x
-        x, turns = np.atleast_2d(np.asarray(x, dtype=np.float64)) - middle, self._turns
-        if turns is not None and (np.abs(x) > turns / 2).any():
-            some = np.isfinite(turns)
-            x[:, some] -= turns[some] * np.round(x[:, some] / turns[some])
-        return np.asarray(x / half)
+        x = np.atleast_2d(np.asarray(x, dtype=np.float64)) - middle
+        return np.asarray((circle.near(x, 0.0, self._angles) if self._angles.any() else x) / half)
 
     def contains(self, x: Array) -> Bools:
         return np.asarray(self.start(x) > 0)

@@ -92,7 +92,7 @@ class Symbolic(Synthesizer):
 
     def _plan(self, model: Model, domain: Domain, goal: Goal, gap: GapFunction | None) -> _Plan:
         """Cells of the states, values of each input, and the box of the states without cells."""
-        goal.check(domain)
+        goal.check(domain, model)
         if self.refine and self.align == "scots":
             raise UsageError("controller.refine: align: scots is solved on one grid; leave refine out, or put cells on tiles")
         inputs, names = self._ranges(domain), domain.states.names

@@ -20,6 +20,7 @@ from gapcert.certification.certificate import Audit, Certificate, Ledger, Record
 from gapcert.certification.compatibility import refuse, unpaired
 from gapcert.certification.gates import entry, hidden_state
 from gapcert.certification.gates.augment import widen
+from gapcert.certification.gates.circle import repeating
 from gapcert.certification.gates.hidden_state import Gate, HiddenPlan
 from gapcert.certification.refutation import watched
 from gapcert.certification.routes import Findings, Request, Route
@@ -87,13 +88,14 @@ def certify(
     entry.contain(model, domain)
     model, backend = widen(model, backend, domain)
     question = question or digest(model, backend, domain)
-    name, backend = by.prepared(request, family, backend, seed)
+    name, drawn = by.prepared(request, family, backend, seed)
     fit = by if name == by.name else known.build("route", name)
-    refuse(model, backend, family, lipschitz, fit, request.claim, sampling.kept(domain) is not None)
+    refuse(model, drawn, family, lipschitz, fit, request.claim, sampling.kept(domain) is not None)
     asked = Question(model, domain, sampling, lipschitz, family, p, by, fit, request, symmetries, seed, question)
 
     plan = replace(hidden or HiddenPlan(), ignore=(*(hidden or HiddenPlan()).ignore, *symmetries))
-    gate = entry.enter(model, backend, domain, plan, request.claim, executor, seed, emit)  # r = f̂ − f is a function of (x, u)
+    gate = entry.enter(model, drawn, domain, plan, request.claim, executor, seed, emit)  # r = f̂ − f is a function of (x, u)
+    gate = replace(gate, turns=repeating(model, backend, domain, seed))  # where angles close on themselves, of the circle
     with Kept(executor) as pools:
         key = digest(model, gate.system, domain)
         store = Store(Path(folder) / "samples", Residual(gate.system, model), key, pools, sampling.chunk, emit)

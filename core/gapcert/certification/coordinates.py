@@ -179,6 +179,10 @@ class _Relative:
         """Twice that of the System itself: u is rounded once more."""
         return np.asarray(2 * self.inner.resolution(magnitude))
 
+    def repeats(self, angle: str) -> str | None:
+        moves = any(row[[s.name for s in self.states].index(angle)] for row in self.relative.slope)
+        return "the coordinates measure inputs relative to it" if moves else self.inner.repeats(angle)
+
     def digest(self) -> str:
         # The System says itself what determines its answers: caches and tiles do not.
         names = [a.name for a in self.inputs]

@@ -33,6 +33,7 @@ class Thresholds:
     spread_points: int = chosen(64, "at which the spread over hidden states is measured")
     spread_draws: int = chosen(16, "hidden states at each of these")
     purity_rows: int = chosen(64, "that are asked again in other orders and shapes")
+    repeat_error: float = chosen(64.0, "times what a step rounds by, that it may change with a turn: sums round more than once")
     held_periods: int = chosen(512, "at most, that one row is asked in a row: a counter in a system shows by then")
     response_error: float = chosen(0.1, "relative, between what an input moves in f̂ and in f: a warning, no refusal")
     response_rows: int = chosen(16, "states at which an input is moved from end to end")

@@ -10,7 +10,7 @@ from typing import final
 import numpy as np
 
 import gapcert
-from gapcert.plugin import Arithmetic, Array, Bools, Box, Domain, GapFunction, Interval, Model, majorant_of
+from gapcert.plugin import Arithmetic, Array, Bools, Domain, GapFunction, Interval, Model, circle, majorant_of
 from gapcert_mpc.thresholds import THRESHOLDS
 
 
@@ -243,9 +243,7 @@ class Nominal:
         """F(z) at points of the frame, but for whole turns of angles, and by how much it may be wrong: (k, nx) each."""
         x, u = z[:, : self.nx], z[:, self.nx :]
         after = self.model.step(x, u).x
-        for j, axis in enumerate(self.model.states):
-            if axis.kind == "angle":
-                after[:, j] += 2 * np.pi * np.round((x[:, j] - after[:, j]) / (2 * np.pi))
+        after = circle.near(after, x, [axis.kind == "angle" for axis in self.model.states])
         error = np.broadcast_to(self.missed(*frame.ends), after.shape) * 2
         if self.predictor is None:
             return after, error

@@ -85,6 +85,9 @@ class Augmented(Backend):
         own, plain = self.system.resolution(magnitude[:nx]), super().resolution(magnitude)
         return np.concatenate([own, plain[nx:] * max(1.0, float((own / plain[:nx]).max()))])
 
+    def repeats(self, angle: str) -> str | None:
+        return self.system.repeats(angle) if angle not in self.names else None
+
     def digest(self) -> str:
         return json_digest(type(self).__qualname__, self.system.digest(), self.names)
 
@@ -151,6 +154,9 @@ class AugmentedModel(Model):
 
     def digest(self) -> str:
         return json_digest(type(self).__qualname__, self.model.digest(), [[s.name, s.unit, s.kind] for s in self.added])
+
+    def repeats(self, angle: str) -> str | None:
+        return "" if angle in [s.name for s in self.added] else self.model.repeats(angle)
 
     def extend(self, extensions: Sequence[Extension]) -> Model:
         return AugmentedModel(self.model.extend(extensions), self.added)

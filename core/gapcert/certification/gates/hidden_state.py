@@ -93,7 +93,7 @@ class Probe:
 @final
 @dataclass(frozen=True)
 class Gate:
-    """What the gates found: `purity` in words, `warnings`, and the branch that was taken with hidden state.
+    """What the gates found: `purity` and `turns` in words, `warnings`, and the branch that was taken with hidden state.
 
     `system` is what is sampled, `bound` (nx,) the spread that acts as further resolution; it cost `spent` transitions.
     """
@@ -106,6 +106,7 @@ class Gate:
     probe: Probe | None = None
     law: Law | None = None
     purity: str = ""
+    turns: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     spent: int = 0
     attack: Mapping[str, Any] = field(default_factory=dict)
@@ -145,7 +146,7 @@ class Gate:
         """What the claim owes to the gates, for the list of assumptions."""
         made = [f"Hidden state that the domain names ({', '.join(self.names)}) is state here, and f holds it constant."]
         found = made if self.plan.mode == "augment" and self.names else []
-        return [*found, *([] if self.probe is None else [self._hidden(self.probe)]), *(f"Warning: {w}." for w in self.warnings)]
+        return [*self.turns, *found, *([] if self.probe is None else [self._hidden(self.probe)]), *(f"Warning: {w}." for w in self.warnings)]
 
     def _hidden(self, p: Probe) -> str:
         listed = ", ".join(p.names)

@@ -12,6 +12,7 @@ import numpy as np
 
 from gapcert.contracts.data.inequality import MalformedError, parse
 from gapcert.contracts.systems.system import StateSpec, System
+from gapcert.numerics import circle
 from gapcert.numerics.arrays import Array, Bools, Ints
 from gapcert.numerics.constraint_zone import Relation as Relation
 from gapcert.numerics.constraint_zone import Zone, centres, grid_at, grid_points, grid_size, lattice
@@ -61,6 +62,12 @@ class Box:
         """The box as one Interval of shape (1, axes)."""
         return Interval(np.asarray(self.low)[None], np.asarray(self.high)[None])
 
+    @property
+    def wraps(self) -> tuple[bool, ...]:
+        """Axes that close on themselves: angles over a full turn."""
+        ends = zip(self.axes, self.low, self.high, strict=True)
+        return tuple(axis.kind == "angle" and circle.spans(low, high) for axis, low, high in ends)
+
     def contains(self, points: Array) -> Bools:
         """(n,) booleans: low ≤ point ≤ high on every axis."""
         return np.asarray(((points >= self.low) & (points <= self.high)).all(axis=-1))
@@ -69,6 +76,16 @@ class Box:
         return all(a >= b for a, b in zip(self.low, other.low, strict=True)) and all(
             a <= b for a, b in zip(self.high, other.high, strict=True)
         )
+
+
+def turned(box: Box, x: Array) -> Array:
+    """x (…, axes) with every angle on the turn of the box, see `circle.onto`."""
+    for j, axis in enumerate(box.axes):
+        column = x[..., j]
+        if axis.kind == "angle" and (moved := circle.onto(box.low[j], box.high[j], column)) is not column:
+            x = x.copy()
+            x[..., j] = moved
+    return x
 
 
 @final
@@ -161,8 +178,16 @@ class Domain:
         return z[..., : self.nx], z[..., self.nx :]
 
     def contains(self, z: Array) -> Bools:
-        """(n,) booleans: in the box, and every relation holds."""
-        return self.zone.contains(z)
+        """(n,) booleans: in the box, and every relation holds; on the circle along axes that close on themselves."""
+        return self.zone.contains(self.turned(z))
+
+    def turned(self, z: Array) -> Array:
+        """z with the angles that close on themselves on the turn of Z; other angles are numbers here."""
+        wraps = np.array([*self.states.wraps, *(False for _ in self.inputs.axes)])
+        if not wraps.any():
+            return z
+        x, u = self.split(z)
+        return np.where(wraps, np.concatenate([turned(self.states, x), u], axis=-1), z)
 
     def draw(self, n: int, rng: np.random.Generator) -> Array:
         """n independent points, uniform on Z; a pure function of the generator's state."""

@@ -13,6 +13,7 @@ import numpy as np
 from gapcert.contracts.systems.extension import Extension as Extension
 from gapcert.contracts.systems.extension import Parameter as Parameter
 from gapcert.contracts.systems.scene import Scene as Scene
+from gapcert.numerics import circle
 from gapcert.numerics.arrays import Array, Bools
 from gapcert.numerics.digest import digest
 from gapcert.numerics.errors import UsageError
@@ -41,10 +42,7 @@ class StateSpec:
         if self.kind == "quaternion":
             return _rotation_vector(a, b)
         d = np.asarray(a - b, dtype=np.float64)
-        if self.kind == "angle":
-            # round(d / 2π) = 0 leaves d untouched, so small differences keep every bit.
-            d = d - 2 * np.pi * np.round(d / (2 * np.pi))
-        return d
+        return circle.near(d) if self.kind == "angle" else d
 
 
 def _rotation_vector(a: Array, b: Array) -> Array:
@@ -132,6 +130,13 @@ class System(ABC):
     def rounding(self, magnitude: Array) -> Array:
         """The part of `resolution` (nx,) that is arithmetic, without what a solver that iterates may leave (default: all)."""
         return self.resolution(magnitude)
+
+    def repeats(self, angle: str) -> str | None:
+        """Is f(x + 2π, u) = f(x, u) along the state of this name, up to whole turns of angles, in what is remembered too?
+
+        Empty where that is proved or declared, else why it is not; None: not known, and it is probed where it matters.
+        """
+        return None
 
     def scene(self, x: Array, hidden: Array | None = None) -> Scene | None:
         """What x (n, nx) looks like, with hidden (n, nh) or its default; None without a body, or where x does not say."""
