@@ -10,7 +10,7 @@ from typing import final
 import numpy as np
 
 import gapcert
-from gapcert.plugin import Arithmetic, Array, Bools, Domain, GapFunction, Interval, Model, circle, majorant_of
+from gapcert.plugin import Arithmetic, Array, Bools, Box, Domain, GapFunction, Interval, Model, circle, majorant_of
 from gapcert_mpc.thresholds import THRESHOLDS
 
 
