@@ -9,7 +9,8 @@ from gapcert.lazy import LazyPackage, homes
 _HOME = homes(
     {
         "gapcert.certification.certificate": (
-            "Audit Certificate Ledger Record StateEvidence domain_data figures gap_digest saved_digest"
+            "Audit Band Certificate Ledger Record SavedStatement StateEvidence Statement domain_data figures gap_digest "
+            "saved_digest"
         ),
         "gapcert.certification.certify": "digest predictor_of",
         "gapcert.certification.compatibility": "unmatched unpaired",
@@ -40,7 +41,7 @@ _HOME = homes(
         "gapcert.contracts.plugins.registry": "Registry hookimpl registry",
         "gapcert.contracts.systems.arithmetic": "Arithmetic",
         "gapcert.contracts.systems.cells": "Cells",
-        "gapcert.contracts.systems.domain": "Box Cover Domain Points turned",
+        "gapcert.contracts.systems.domain": "Box Cover Domain Outside Points turned",
         "gapcert.contracts.systems.extension": "Extension Memory Parameter",
         "gapcert.contracts.systems.region": "Ellipsoid Polytope Region",
         "gapcert.contracts.systems.scene": "GREY Scene Shape at_rest",

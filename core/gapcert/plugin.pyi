@@ -1,8 +1,11 @@
 from gapcert.certification.certificate import Audit as Audit
+from gapcert.certification.certificate import Band as Band
 from gapcert.certification.certificate import Certificate as Certificate
 from gapcert.certification.certificate import Ledger as Ledger
 from gapcert.certification.certificate import Record as Record
+from gapcert.certification.certificate import SavedStatement as SavedStatement
 from gapcert.certification.certificate import StateEvidence as StateEvidence
+from gapcert.certification.certificate import Statement as Statement
 from gapcert.certification.certificate import domain_data as domain_data
 from gapcert.certification.certificate import figures as figures
 from gapcert.certification.certificate import gap_digest as gap_digest
@@ -101,6 +104,7 @@ from gapcert.contracts.systems.cells import Cells as Cells
 from gapcert.contracts.systems.domain import Box as Box
 from gapcert.contracts.systems.domain import Cover as Cover
 from gapcert.contracts.systems.domain import Domain as Domain
+from gapcert.contracts.systems.domain import Outside as Outside
 from gapcert.contracts.systems.domain import Points as Points
 from gapcert.contracts.systems.domain import turned as turned
 from gapcert.contracts.systems.extension import Extension as Extension

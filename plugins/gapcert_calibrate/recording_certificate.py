@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
-import json
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -16,6 +14,7 @@ import numpy.typing as npt
 
 from gapcert.plugin import (
     Array,
+    Band,
     Claim,
     Domain,
     GapFamily,
@@ -27,22 +26,19 @@ from gapcert.plugin import (
     Predictor,
     Recording,
     Samples,
-    Shown,
+    SavedStatement,
     StateEvidence,
     UsageError,
     __version__,
     beta_of,
-    domain_data,
     figures,
     gap_digest,
     in_words,
-    npz_bytes,
     order_statistics,
     predictor_of,
     registry,
-    write_atomic,
 )
-from gapcert_monitor import Certified, Check, Monitor, check
+from gapcert_monitor import Certified
 from gapcert_recordings import Transitions
 
 from .route import CalibratedGap, NoConstants, constant, ends, scale_of
@@ -117,7 +113,7 @@ class Windows:
 
 @final
 @dataclass(frozen=True, repr=False)
-class CalibratedRecording(Shown):
+class CalibratedRecording(SavedStatement):
     """A band that holds for all transitions of a further window, with probability 1 − ε on average over calibrations.
 
     `units` windows met Z; those of `fit` gave the band, those of `held` its widening: score · scale, (nx,), with the score of
@@ -144,11 +140,14 @@ class CalibratedRecording(Shown):
     @property
     def certified(self) -> Certified:
         """For `check`, which holds other recordings against the band."""
-        return Certified(self.model, self.problem.domain.zone, self.gap.interval)
+        return Certified.of(self)
 
     @property
     def domain(self) -> Domain:
         return self.problem.domain
+
+    def _about(self) -> tuple[Domain, Band]:
+        return self.domain, self.gap.interval
 
     @property
     def vacuous(self) -> bool:
@@ -179,21 +178,9 @@ class CalibratedRecording(Shown):
             )
         return said
 
-    def check(self, recording: Recording, noise: Mapping[str, float] | None = None) -> Check:
-        """New measurements against γ; noise: by how much channels may err, in the model's units."""
-        return check(self.certified, recording, noise)
-
-    def monitor(self) -> Monitor:
-        """γ watched online, one transition at a time."""
-        return Monitor(self.certified)
-
     def digest(self) -> str:
         """Identity of the band and of its claim."""
         return f"recording:{gap_digest(self.gap, self.problem)}:{self.claim.epsilon!r}:{self.claim.beta!r}"
-
-    def gamma(self, x: Array, u: Array) -> Array:
-        """γ(x, u): x (n, nx), u (n, nu) → (n, nx)."""
-        return self.gap.gamma(np.hstack([x, u]))
 
     def summary(self) -> dict[str, Any]:
         measured = {
@@ -220,30 +207,15 @@ class CalibratedRecording(Shown):
 
     def save(self, folder: Path | str) -> None:
         """`certificate.json` and `certificate.npz`, with all transitions: `gapcert verify` makes rank and scores again."""
-        p, where = self.problem, Path(folder)
-        arrays: dict[str, npt.NDArray[Any]] = {f"gap.{k}": v for k, v in self.gap.arrays().items()}
-        arrays |= {f"predictor.{k}": v for k, v in p.predictor.arrays().items()}
+        p = self.problem
+        arrays: dict[str, npt.NDArray[Any]] = {f"predictor.{k}": v for k, v in p.predictor.arrays().items()}
         arrays |= {"lipschitz": p.lipschitz.value, "resolution": p.resolution, "remainder.resolution": p.remainder_resolution}
         arrays |= {"fit.z": p.samples.z, "fit.r": p.samples.r, "fit.windows": np.unique(self.fit.window)}
         arrays |= {"held.z": self.held.z, "held.r": self.held.r, "held.window": self.held.window}
         arrays |= {"calibration.scale": self.scale}
         if p.predictor.kind == "model":
             arrays |= {"predictor.samples": p.predictor(p.samples.z), "predictor.calibration": p.predictor(self.held.z)}
-        content, domain = npz_bytes(arrays), p.domain
-        data = {
-            **self.summary(),
-            "form": dict(self.gap.form),
-            "predictor": p.predictor.kind,
-            "domain": domain_data(domain),
-            "cover": None,
-            "seed": p.seed,
-            "digests": {},
-            "arrays": hashlib.sha256(content).hexdigest(),
-            "versions": dict(self.versions),
-        }
-        where.mkdir(parents=True, exist_ok=True)
-        write_atomic(where / "certificate.npz", content)
-        write_atomic(where / "certificate.json", json.dumps(data, indent=1, sort_keys=True).encode())
+        self._write(Path(folder), p.predictor.kind, arrays, cover=None, seed=p.seed, digests={})
 
 
 def calibrate_recording(

@@ -24,6 +24,7 @@ from gapcert.plugin import (
     Controller,
     Goal,
     Ints,
+    Outside,
     Policy,
     UsageError,
     circle,
@@ -131,15 +132,16 @@ class GridController(Controller):
         small = self.splits is None or math.prod(self.counts) <= Splits.PAINTED
         return tuple(p for p in POLICIES if p != "adversarial" or (self.successors is not None and small))
 
-    def act(self, x: Array, policy: Policy, seed: int = 0, k: int = 0) -> Array:
-        """One allowed input per state, chosen as `policies` says; UsageError outside the domain."""
+    def act(self, x: Array, policy: Policy, seed: int = 0, k: int = 0, *, outside: Outside = "raise") -> Array:
+        """One allowed input per state, chosen as `policies` says; UsageError outside the domain, or NaN."""
         known(policy)
+        if outside == "nan":
+            return self.inside_alone(self.points.shape[1], x, policy, seed, k)
         x = np.atleast_2d(np.asarray(x, dtype=np.float64))
         cell = self.cells(x)
         lost = np.flatnonzero((cell < 0) | (self.values[cell] < 0))
         if lost.size:
-            state = ", ".join(f"{a.name} = {v!r}" for a, v in zip(self.goal.stay.axes, x[lost[0]].tolist(), strict=True))
-            raise UsageError(f"controller: row {lost[0]}: {state} is outside its domain; ask `contains` before `act`")
+            raise self.refusal(x, int(lost[0]))
         allowed = self.allowed(cell)
         number = allowed.sum(axis=1, dtype=np.int64)
         if not number.all():

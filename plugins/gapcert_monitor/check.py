@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, final
 
@@ -12,21 +13,33 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array, Interval, Model, Recording, Trajectory, UsageError
-from gapcert.plugin import Coordinates, RelativeModel, Zone, circle, damage_told, difference, magnitude, stated_units, without_units
+from gapcert.plugin import (
+    Band,
+    Box,
+    Coordinates,
+    Domain,
+    RelativeModel,
+    Statement,
+    Zone,
+    circle,
+    damage_told,
+    difference,
+    magnitude,
+    stated_units,
+    without_units,
+)
 from gapcert_monitor.thresholds import THRESHOLDS
 from gapcert_recordings import Transitions, axes
 from gapcert_verify import Evidence, bounds, load, zone
 
 if TYPE_CHECKING:
-    from gapcert.plugin import Certificate, Declaration, Predictor
+    from gapcert.plugin import Predictor
     from gapcert_recordings import Table
-
-Band = Callable[[Array], tuple[Array, Array]]
 
 
 @final
 @dataclass(frozen=True)
-class Certified:
+class Certified(Statement):
     """What a certificate is about: the model f, the set Z, and (l, u) at points of it.
 
     `relative`: where Z and the band are in coordinates (x, w) and the model in (x, u), how w is made.
@@ -37,9 +50,21 @@ class Certified:
     band: Band
     relative: Coordinates | None = None
 
+    @cached_property
+    def domain(self) -> Domain:
+        """Z with its names and units."""
+        (low, high), nx = (self.zone.low, self.zone.high), self.model.nx
+        inputs = self.model.inputs if self.relative is None else self.relative.axes
+        return Domain(Box(self.model.states, low[:nx], high[:nx]), Box(inputs, low[nx:], high[nx:]), self.zone.relations)
+
+    def _about(self) -> tuple[Domain, Band]:
+        return self.domain, self.band
+
     @classmethod
-    def of(cls, certificate: Certificate | Declaration) -> Certified:
-        """UsageError where the certificate has lost its model, as one that was unpickled without it."""
+    def of(cls, certificate: Any) -> Certified:
+        """Of any statement; UsageError where it has lost its model, as a certificate that was unpickled without it."""
+        if isinstance(certificate, Certified):
+            return certificate
         model = certificate.model
         if model is None:
             raise UsageError(

@@ -21,6 +21,7 @@ from .cells.bounds import Bound, Enclosed, Grown, inferred
 from .cells.gaps import Disturbance, disturbance
 from .cells.grid import Grid, combined, multiples, spaced
 from .cells.held import Left, invariant, offered
+from .games.authority import sufficient
 from .games.games import Labels, solve_goal, started, usable
 from .games.reason import in_words, tried, why_empty
 from .games.refinement import Refined, refined
@@ -210,6 +211,7 @@ class Symbolic(Synthesizer):
     def _reason(self, problem: SynthesisProblem, plan: _Plan, added: Disturbance | None, made: _Made) -> dict[str, Any]:
         """Why nothing wins, and what would have to change."""
         grid = plan.grid
+        few = grid.nodes is None and grid.size * made.inputs <= THRESHOLDS.change_pairs
         cause = why_empty(problem, made.labels, added, made.paths, made.safe(), made.target, plan.inputs)
 
         def wins(scale: float, factor: int) -> bool:
@@ -220,9 +222,18 @@ class Symbolic(Synthesizer):
             found = self._made(problem, plan._replace(grid=finer), over)
             return found.won(1 if found.beyond else 0) > 0
 
-        change = tried(wins, grid, made.inputs, added is not None)
+        def held(inputs: Box) -> bool:
+            axes = tuple(spaced(a, b, len(v)) for a, b, v in zip(inputs.low, inputs.high, plan.axes, strict=True))
+            found = self._made(problem, plan._replace(axes=axes, inputs=inputs), None)
+            return found.won(1 if found.beyond else 0) > 0
+
+        change = tried(wins, grid, made.inputs, added is not None) if not cause.of else {}
+        without = not cause.of and added is not None and few and "gap_scale" not in change
+        if few and not change and cause.of != "goal" and (wider := sufficient(held, plan.inputs, cause.needed)) is not None:
+            change["inputs"] = wider.bounds
         beyond = "nothing beyond the target: " if made.won() else ""
-        return {"reason": beyond + cause.text + in_words(change), "change": {**cause.change, **change}}
+        told = in_words(change, plan.inputs, without, few and not cause.of)
+        return {"reason": beyond + cause.text + told, "change": {**cause.change, **change}}
 
 
 @final

@@ -100,7 +100,11 @@ def test_what_wraps_a_system_hands_its_proof_on() -> None:
 
 
 def test_a_goal_over_a_turn_needs_a_model_that_repeats() -> None:
-    for model, ranges, fits in ((text(), FULL, True), (text("0.9*h + 0.05*w"), FULL, False), (text("0.9*h + 0.05*w"), PART, True)):
+    for model, ranges, fits in (
+        (text(), FULL, True),
+        (text("0.9*h + 0.05*w"), FULL, False),
+        (text("0.9*h + 0.05*w"), PART, True),
+    ):
         domain = Domain.of(model, ranges)
         goal = gc.Goal("invariance", domain.states)
         if fits:
@@ -113,7 +117,9 @@ def test_a_goal_over_a_turn_needs_a_model_that_repeats() -> None:
 def test_a_certificate_says_so(tmp_path) -> None:
     options = {"lipschitz": gc.registry().build("lipschitz", "interval"), "sampling": gc.AdaptiveSampling(40)}
     f, fhat = text(), text(w="w - 0.19*sin(h) + 0.05*u")
-    made = gc.certify(f, fhat, Domain.of(f, FULL), request=gc.Request("deterministic", 0.1, 0.1), folder=tmp_path / "a", **options)
+    made = gc.certify(
+        f, fhat, Domain.of(f, FULL), request=gc.Request("deterministic", 0.1, 0.1), folder=tmp_path / "a", **options
+    )
     assert made.claim.kind == "deterministic"
     assert sum("h closes on itself" in s for s in made.assumptions) == 1
     with pytest.raises(gc.UsageError, match="does not repeat with it"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
@@ -20,7 +20,7 @@ from gapcert.contracts.gaps.gap import GapFunction, GapProblem
 from gapcert.contracts.gaps.lipschitz import LipschitzBound
 from gapcert.contracts.gaps.predictor import Samples
 from gapcert.contracts.plugins.presentation import Shown
-from gapcert.contracts.systems.domain import Domain
+from gapcert.contracts.systems.domain import Domain, Outside
 from gapcert.contracts.systems.system import Model, difference
 from gapcert.numerics.arrays import Array, Bools
 from gapcert.numerics.atomic_files import npz_bytes, write_atomic
@@ -220,8 +220,49 @@ class Record(ABC):
         """What `gapcert verify` needs besides the samples, named as in `certificate.npz`."""
 
 
-class Statement(Shown, ABC):
-    """What a certificate or a person says of γ: it is asked, held against measurements, and saved."""
+Band = Callable[[Array], tuple[Array, Array]]
+"""(l, u) at points z (n, nz), each (n, nx)."""
+
+
+class Statement(ABC):
+    """What is said of γ on a set Z, by a certificate, a person, or either as it was stored: asked there, and held against
+    measurements. Points are in the coordinates of Z: where a spec has `coordinates:`, u are these.
+    """
+
+    @abstractmethod
+    def _about(self) -> tuple[Domain, Band]:
+        """Z, and (l, u) at points of it."""
+
+    def interval(self, x: Array, u: Array, *, outside: Outside = "raise") -> tuple[Array, Array]:
+        """(l, u) with l ≤ f̂ − f ≤ u: x (n, nx) or (nx,), u (n, nu) or (nu,) → (n, nx) each.
+
+        Where (x, u) is not in Z, nothing is known: UsageError that names the axis and its value, or with `outside="nan"` a row
+        of NaN.
+        """
+        z = np.concatenate([np.atleast_2d(np.asarray(v, dtype=float)) for v in (x, u)], axis=1)
+        domain, band = self._about()
+        inside = domain.asked(z, outside)
+        both = np.full((2, len(z), domain.nx), np.nan)
+        if inside.any():
+            both[:, inside] = band(z[inside])
+        return both[0], both[1]
+
+    def gamma(self, x: Array, u: Array, *, outside: Outside = "raise") -> Array:
+        """γ(x, u) = max(|l|, |u|), (n, nx); x, u and outside as for `interval`."""
+        low, high = self.interval(x, u, outside=outside)
+        return np.asarray(np.maximum(np.abs(low), np.abs(high)))
+
+    def check(self, recording: Recording, noise: Mapping[str, float] | None = None) -> Any:
+        """New measurements against γ, as a `Check`; noise: by how much channels may err, in the model's units."""
+        return gapcert.check(gapcert.Certified.of(self), recording, noise)
+
+    def monitor(self) -> Any:
+        """γ watched online, one transition at a time: a `Monitor`."""
+        return gapcert.Monitor(gapcert.Certified.of(self))
+
+
+class SavedStatement(Statement, Shown):
+    """One that holds its gap function: it is shown, and saved."""
 
     gap: GapFunction
     versions: Mapping[str, str]
@@ -230,39 +271,26 @@ class Statement(Shown, ABC):
     def summary(self) -> dict[str, Any]:
         """The `certificate` object of the JSON contract."""
 
-    def gamma(self, x: Array, u: Array) -> Array:
-        """γ(x, u): x (n, nx) or (nx,), u (n, nu) or (nu,) → (n, nx)."""
-        z = np.concatenate([np.atleast_2d(np.asarray(x, dtype=float)), np.atleast_2d(np.asarray(u, dtype=float))], axis=1)
-        return self.gap.gamma(z)
-
-    # `Certified.of` takes a Certificate or a Declaration, and types know no class that has no other subclasses: hence Any.
-    def check(self: Any, recording: Recording, noise: Mapping[str, float] | None = None) -> Any:
-        """New measurements against γ, as a `Check`; noise: by how much channels may err, in the model's units."""
-        return gapcert.check(gapcert.Certified.of(self), recording, noise)
-
-    def monitor(self: Any) -> Any:
-        """γ watched online, one transition at a time: a `Monitor`."""
-        return gapcert.Monitor(gapcert.Certified.of(self))
-
-    def _write(self, folder: Path, domain: Domain, predictor: str, arrays: Mapping[str, Array], **more: Any) -> None:
+    def _write(self, folder: Path, predictor: str, arrays: Mapping[str, Array], **more: Any) -> None:
         """`certificate.json`, the summary and `more`, and `certificate.npz`, γ's own arrays and others."""
         content = npz_bytes({**{f"gap.{k}": v for k, v in self.gap.arrays().items()}, **arrays})
         data = {
             **self.summary(),
             "form": dict(self.gap.form),
             "predictor": predictor,
-            "domain": domain_data(domain),
+            "domain": domain_data(self._about()[0]),
             "arrays": hashlib.sha256(content).hexdigest(),
             "versions": dict(self.versions),
             **more,
         }
+        folder.mkdir(parents=True, exist_ok=True)
         write_atomic(folder / "certificate.npz", content)
         write_atomic(folder / "certificate.json", json.dumps(data, indent=1, sort_keys=True).encode())
 
 
 @final
 @dataclass(frozen=True, repr=False)
-class Certificate(Statement):
+class Certificate(SavedStatement):
     """γ with l ≤ r ≤ u, what that rests on, and the evidence."""
 
     gap: GapFunction
@@ -281,6 +309,9 @@ class Certificate(Statement):
     @property
     def domain(self) -> Domain:
         return self.problem.domain
+
+    def _about(self) -> tuple[Domain, Band]:
+        return self.domain, self.gap.interval
 
     @property
     def samples(self) -> Samples:
@@ -362,7 +393,6 @@ class Certificate(Statement):
             arrays["predictor.samples"] = p.predictor(p.samples.z)
         self._write(
             folder,
-            p.domain,
             p.predictor.kind,
             arrays,
             symmetry=None if p.symmetry is None else p.symmetry.to_data(),

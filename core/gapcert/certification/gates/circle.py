@@ -58,6 +58,8 @@ def _witness(system: System, j: int, x: Array, u: Array) -> str:
         e = system.resolution(np.maximum(np.abs(here), np.abs(there)).max(axis=0))
         excess = np.abs(difference(system.states, there, here)) - THRESHOLDS.repeat_error * (e + rounding)
         if not (excess <= 0).all():
-            i, c = np.unravel_index(int(np.argmax(np.where(excess <= 0, -np.inf, np.nan_to_num(excess, nan=np.inf)))), excess.shape)
+            i, c = np.unravel_index(
+                int(np.argmax(np.where(excess <= 0, -np.inf, np.nan_to_num(excess, nan=np.inf)))), excess.shape
+            )
             return f"from (x, u) = {[*x[i].tolist(), *u[i].tolist()]} its state {c} becomes {here[i, c]:.6g}, {k:+d} turn on {there[i, c]:.6g}"
     return ""

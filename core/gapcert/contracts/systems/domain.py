@@ -6,7 +6,7 @@ import functools
 import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, final
+from typing import Any, Literal, final
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from gapcert.numerics.constraint_zone import Relation as Relation
 from gapcert.numerics.constraint_zone import Zone, centres, grid_at, grid_points, grid_size, lattice
 from gapcert.numerics.errors import UsageError
 from gapcert.numerics.intervals import Interval, norm
+
+Outside = Literal["raise", "nan"]
+"""What an answer is where nothing is known: a UsageError that names the axis and its value, or NaN in that row alone."""
 
 
 @final
@@ -71,6 +74,13 @@ class Box:
     def contains(self, points: Array) -> Bools:
         """(n,) booleans: low ≤ point ≤ high on every axis."""
         return np.asarray(((points >= self.low) & (points <= self.high)).all(axis=-1))
+
+    def leaves(self, point: Array) -> str:
+        """Along which axis a point (axes,) lies outside, in words; "" inside."""
+        for axis, value, low, high in zip(self.axes, point.tolist(), self.low, self.high, strict=True):
+            if not low <= value <= high:
+                return f"{axis.name} = {value!r} is outside [{low:g}, {high:g}] {axis.unit}".removesuffix(" 1")
+        return ""
 
     def within(self, other: Box) -> bool:
         return all(a >= b for a, b in zip(self.low, other.low, strict=True)) and all(
@@ -188,6 +198,19 @@ class Domain:
             return z
         x, u = self.split(z)
         return np.where(wraps, np.concatenate([turned(self.states, x), u], axis=-1), z)
+
+    def asked(self, z: Array, outside: Outside) -> Bools:
+        """`contains`, of points at which an answer is wanted; UsageError at the first one outside, unless that is to be NaN."""
+        inside = self.contains(z)
+        if outside == "raise" and not inside.all():
+            row = int(np.argmin(inside))
+            x, u = self.split(z[row])
+            what = self.states.leaves(x) or self.inputs.leaves(u) or f"'{self.zone.broken(z[row])}' does not hold"
+            raise UsageError(
+                f"certificate: row {row}: {what}, and outside of its domain nothing is known of f̂ − f; ask inside, or take "
+                f"outside='nan'"
+            )
+        return inside
 
     def draw(self, n: int, rng: np.random.Generator) -> Array:
         """n independent points, uniform on Z; a pure function of the generator's state."""
