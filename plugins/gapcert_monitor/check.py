@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, final
 
@@ -12,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array, Interval, Model, Recording, Trajectory, UsageError
-from gapcert.plugin import Coordinates, RelativeModel, Zone, damage_told, difference, magnitude, stated_units, without_units
+from gapcert.plugin import TURN, Coordinates, RelativeModel, Zone, damage_told, difference, magnitude, stated_units, without_units
 from gapcert_monitor.thresholds import THRESHOLDS
 from gapcert_recordings import Transitions, axes
 from gapcert_verify import Evidence, bounds, load, zone
@@ -89,14 +90,20 @@ class Certified:
 
     def points(self, x: Array, u: Array) -> Array:
         """z (n, nz) in the coordinates of Z; angles on the turn that is nearest to the middle of Z."""
-        z = np.hstack([x, u])
-        for j, axis in enumerate(self.model.states):
-            if axis.kind == "angle":
-                middle = (self.zone.low[j] + self.zone.high[j]) / 2
-                turns = np.round((z[:, j] - middle) / (2 * np.pi))
-                # A whole turn is subtracted only where there is one: it is rounded.
-                z[:, j] = np.where(turns != 0, z[:, j] - 2 * np.pi * turns, z[:, j])
+        z = np.concatenate([x, u], axis=1)
+        for j, middle in self._turning:
+            away = z[:, j] - middle
+            # A whole turn is subtracted only where there is one: it is rounded.
+            if not (np.abs(away) <= np.pi).all():
+                turns = np.round(away / TURN)
+                z[:, j] = np.where(turns != 0, z[:, j] - TURN * turns, z[:, j])
         return z if self.relative is None else self.relative.over(Interval.exact(z)).mid
+
+    @cached_property
+    def _turning(self) -> list[tuple[int, float]]:
+        """(axis, the middle of Z along it) of the states that are angles."""
+        z = self.zone
+        return [(j, (z.low[j] + z.high[j]) / 2) for j, axis in enumerate(self.model.states) if axis.kind == "angle"]
 
     def residual(self, x: Array, u: Array, x_next: Array) -> Array:
         """r = x⁺ − f(x, u), (n, nx)."""
@@ -333,20 +340,19 @@ class Monitor:
 
     def step(self, x: Array, u: Array, x_next: Array) -> Observation:
         """x (nx,), u (nu,), held for the period, and x_next (nx,)."""
-        at, given, after = (np.asarray(v, dtype=np.float64).reshape(1, -1) for v in (x, u, x_next))
+        at, given, after = (np.array(v, dtype=np.float64, ndmin=2) for v in (x, u, x_next))
         c = self._certified
-        z = c.points(at, given)
-        r = c.residual(at, given, after)
+        z, r = c.points(at, given), c.residual(at, given, after)[0]
         if not c.zone.contains(z)[0]:
             self.outside += 1
-            return Observation(False, r[0], np.full(r.shape[1], np.inf), False)
+            return Observation(False, r, np.full(len(r), np.inf), False)
         low, high = c.band(z)
-        gamma = np.maximum(np.abs(low), np.abs(high))
+        gamma = np.maximum(np.abs(low[0]), np.abs(high[0]))
         # A value that is not a number does not confirm γ.
-        violated = not bool((np.abs(r) <= gamma).all())
+        violated = not all(abs(a) <= b for a, b in zip(r.tolist(), gamma.tolist(), strict=True))
         self.points += 1
         self.violations += violated
-        return Observation(True, r[0], gamma[0], violated)
+        return Observation(True, r, gamma, violated)
 
     @property
     def rate(self) -> float | None:
