@@ -13,21 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array, Interval, Model, Recording, Trajectory, UsageError
-from gapcert.plugin import (
-    Band,
-    Box,
-    Coordinates,
-    Domain,
-    RelativeModel,
-    Statement,
-    Zone,
-    circle,
-    damage_told,
-    difference,
-    magnitude,
-    stated_units,
-    without_units,
-)
+from gapcert.plugin import TURN, Band, Box, Coordinates, Domain, RelativeModel, Statement, Zone, circle, damage_told, difference, magnitude, stated_units, without_units
 from gapcert_monitor.thresholds import THRESHOLDS
 from gapcert_recordings import Transitions, axes
 from gapcert_verify import Evidence, bounds, load, zone
@@ -114,11 +100,16 @@ class Certified(Statement):
 
     def points(self, x: Array, u: Array) -> Array:
         """z (n, nz) in the coordinates of Z; angles on the turn of Z."""
-        z = np.hstack([x, u])
-        for j, axis in enumerate(self.model.states):
-            if axis.kind == "angle":
-                z[:, j] = circle.onto(self.zone.low[j], self.zone.high[j], z[:, j])
+        z = np.concatenate([x, u], axis=1)
+        for j, low, high in self._turning:
+            z[:, j] = circle.onto(low, high, z[:, j])
         return z if self.relative is None else self.relative.over(Interval.exact(z)).mid
+
+    @cached_property
+    def _turning(self) -> list[tuple[int, float, float]]:
+        """(axis, ends of Z along it) of the states that are angles."""
+        kinds = (axis.kind for axis in self.model.states)
+        return [(j, self.zone.low[j], self.zone.high[j]) for j, kind in enumerate(kinds) if kind == "angle"]
 
     def residual(self, x: Array, u: Array, x_next: Array) -> Array:
         """r = x⁺ − f(x, u), (n, nx)."""
@@ -355,20 +346,19 @@ class Monitor:
 
     def step(self, x: Array, u: Array, x_next: Array) -> Observation:
         """x (nx,), u (nu,), held for the period, and x_next (nx,)."""
-        at, given, after = (np.asarray(v, dtype=np.float64).reshape(1, -1) for v in (x, u, x_next))
+        at, given, after = (np.array(v, dtype=np.float64, ndmin=2) for v in (x, u, x_next))
         c = self._certified
-        z = c.points(at, given)
-        r = c.residual(at, given, after)
+        z, r = c.points(at, given), c.residual(at, given, after)[0]
         if not c.zone.contains(z)[0]:
             self.outside += 1
-            return Observation(False, r[0], np.full(r.shape[1], np.inf), False)
+            return Observation(False, r, np.full(len(r), np.inf), False)
         low, high = c.band(z)
-        gamma = np.maximum(np.abs(low), np.abs(high))
+        gamma = np.maximum(np.abs(low[0]), np.abs(high[0]))
         # A value that is not a number does not confirm γ.
-        violated = not bool((np.abs(r) <= gamma).all())
+        violated = not all(abs(a) <= b for a, b in zip(r.tolist(), gamma.tolist(), strict=True))
         self.points += 1
         self.violations += violated
-        return Observation(True, r[0], gamma[0], violated)
+        return Observation(True, r, gamma, violated)
 
     @property
     def rate(self) -> float | None:

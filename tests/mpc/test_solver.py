@@ -114,6 +114,27 @@ def test_infeasible_is_told(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("set_up", [True, False])
+@pytest.mark.parametrize("part", ["bounds", "cost", "rows"])
+def test_what_no_library_takes_has_no_answer(name: Any, set_up: bool, part: str) -> None:
+    program = Random(6)
+    good, kept = program.qp, program.made(name)
+    low, q, A = program.low.copy(), program.q.copy(), program.A.copy()
+    low[20], q[3], A.data[5] = program.high[20] + 0.3, np.nan, np.inf
+    bad = good._replace(**{"bounds": {"low": low}, "cost": {"q": q}, "rows": {"A": A}}[part])
+    if set_up:
+        kept = solver(name, bad, 1e-7)
+    else:
+        kept.update(bad, varied=True)
+    answer = kept.solve(np.zeros(len(q)), np.zeros(len(low)))
+    assert answer.status == "infeasible"
+    assert np.isnan(answer.z).all()
+    if not set_up:  # and what is asked next has not seen it
+        kept.update(good)
+        assert kept.solve().status == "solved"
+
+
+@pytest.mark.parametrize("name", SOLVERS)
 def test_an_answer_is_a_function_of_data_and_guess(name: str) -> None:
     program = Random(3)
     one, two = program.made(name), program.made(name)

@@ -46,6 +46,11 @@ class Zone:
         return out
 
     @functools.cached_property
+    def ends(self) -> tuple[Array, Array]:
+        """(low, high), each (nz,)."""
+        return np.array(self.low), np.array(self.high)
+
+    @functools.cached_property
     def matrix(self) -> Array:
         """a, (relations, nz)."""
         return np.array([r.coefficients for r in self.relations], dtype=np.float64).reshape(-1, len(self.low))
@@ -72,7 +77,8 @@ class Zone:
 
     def contains(self, z: Array) -> Bools:
         """(n,): in the box, and every relation holds."""
-        return np.asarray(((z >= self.low) & (z <= self.high)).all(axis=1) & self.related(z))
+        boxed = ((z >= self.ends[0]) & (z <= self.ends[1])).all(axis=1)
+        return np.asarray(boxed & self.related(z) if self.relations else boxed)
 
     def outside(self, boxes: Interval) -> Bools:
         """(n,): the box does not meet Z for certain, since the least a·z over it lies above some b. (n, nz)."""

@@ -26,7 +26,7 @@ class Cones:
 
     def __init__(self, z: Array, g: Array, lipschitz: Array) -> None:
         self._z, self._g, self._lipschitz = np.ascontiguousarray(z.T), np.ascontiguousarray(g.T), lipschitz
-        self._largest = np.abs(g).max(axis=0)
+        self._largest, self._columns = np.abs(g).max(axis=0), list(np.ascontiguousarray(lipschitz.T)[:, :, None])
 
     def __call__(self, z: Array) -> tuple[Array, Array]:
         n, nx = len(z), len(self._g)
@@ -40,6 +40,15 @@ class Cones:
         out = np.empty((n, nx)), np.empty((n, nx))
         out[0][order], out[1][order] = lower.T, upper.T
         return out
+
+    def one_row(self, z: Array) -> tuple[Array, Array]:
+        """(lower, upper), each (nx,), at one point z (nz,): to the same bits, for all states at once."""
+        away = z[:, None] - self._z
+        np.abs(away, out=away)
+        total = self._columns[0] * away[0]
+        for column, part in zip(self._columns[1:], away[1:], strict=True):
+            total += column * part
+        return np.maximum.reduce(self._g - total, axis=1), np.minimum.reduce(self._g + total, axis=1)
 
     def lowest(self, i: int, sign: int, z: Array) -> Ints:
         """(n,): the number of a cone of sign · g that is smallest at each point z (n, nz)."""

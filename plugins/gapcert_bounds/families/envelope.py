@@ -10,7 +10,19 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.plugin import Array, Cells, Domain, GapFamily, GapFunction, GapProblem, Interval, Ints, Predictor, UsageError
+from gapcert.plugin import (
+    AffinePredictor,
+    Array,
+    Cells,
+    Domain,
+    GapFamily,
+    GapFunction,
+    GapProblem,
+    Interval,
+    Ints,
+    Predictor,
+    UsageError,
+)
 
 from .cone import Cones
 from .multilinear import made
@@ -41,12 +53,28 @@ class EnvelopeGap(GapFunction):
         slope = predictor.arrays().get("slope") if predictor.kind in ("none", "affine") else np.ones_like(lipschitz)
         self._active = np.flatnonzero(moves if slope is None else moves | slope.any(axis=0))
         self._largest = np.abs(g).max(axis=0)
+        affine = (predictor.offset, predictor.slope) if isinstance(predictor, AffinePredictor) else ()
+        self._numbers = [part.tolist() for part in (*affine, self._largest, 2 * resolution)]
 
     def interval(self, z: Array) -> tuple[Array, Array]:
+        if len(z) == 1 and len(self._numbers) == 4:
+            return self._one_row(z[0])
         lower, upper = self._cones(z)
         p = self.predictor(z)
         low = p + lower - 2 * self.resolution - self._rounding(p, lower)
         return low, p + upper + 2 * self.resolution + self._rounding(p, upper)
+
+    def _one_row(self, z: Array) -> tuple[Array, Array]:
+        """`interval` of one point (nz,), to the same bits: beyond the cones there is too little to do for arrays."""
+        values, low, high = z.tolist(), [], []
+        lower, upper = self._cones.one_row(z)
+        factor = (2 * len(values) + 8) * _EPS
+        for p, slope, largest, slack, a, b in zip(*self._numbers, lower.tolist(), upper.tolist(), strict=True):
+            for value, c in zip(values, slope, strict=True):
+                p += value * c
+            low.append(p + a - slack - (factor * (abs(p) + abs(a) + 2 * largest + slack) + _TINY))
+            high.append(p + b + slack + (factor * (abs(p) + abs(b) + 2 * largest + slack) + _TINY))
+        return np.array([low]), np.array([high])
 
     def gamma_of(self, boxes: Interval, i: int) -> Array:
         # |z_j − z_kj| ≤ |c_j − z_kj| + h_j over a box: the band at its centre c, widened by Σ_j L_ij h_j, holds for all of it.

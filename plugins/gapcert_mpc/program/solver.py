@@ -38,28 +38,57 @@ class Qp(NamedTuple):
 class QpSolver(ABC):
     """For a program, and for others with the same P and the same pattern of A.
 
-    Rows with low = high when it is set up stay equations, and those without a bound have none.
+    Rows with low = high when it is set up stay equations, and those without a bound have none. A program that has a row with
+    low > high, as where a tube is wider than its room, or a number that is none, has no answer, and no library is asked.
     """
 
     name: Name
     solved: Any
     bad: tuple[Any, ...]
 
-    @abstractmethod
-    def __init__(self, qp: Qp, tolerance: float) -> None: ...
+    def __init__(self, qp: Qp, tolerance: float, **settings: Any) -> None:
+        self.shape, self.hopeless, self.behind = qp.A.shape, _hopeless(qp), _hopeless(qp)
+        self._set_up(_mended(qp) if self.hopeless else qp, tolerance, **settings)
 
     @abstractmethod
+    def _set_up(self, qp: Qp, tolerance: float) -> None: ...
+
+    @final
     def update(self, qp: Qp, varied: bool = False) -> None:
         """Other vectors, and other values of A where it is `varied`."""
+        self.hopeless, self.behind = _hopeless(qp), self.behind or varied
+        if not self.hopeless:
+            self._update(qp, self.behind)
+            self.behind = False
 
     @abstractmethod
+    def _update(self, qp: Qp, varied: bool) -> None: ...
+
+    @final
     def solve(self, z: Array | None = None, y: Array | None = None) -> Answer:
         """From the guess (z, y) where the method can use one: a pure function of the data and the guess."""
+        if self.hopeless:
+            return Answer(np.full(self.shape[1], np.nan), np.zeros(self.shape[0]), "infeasible", 0)
+        return self._solve(z, y)
+
+    @abstractmethod
+    def _solve(self, z: Array | None, y: Array | None) -> Answer: ...
 
     def _answer(self, z: Any, y: Array, found: Any, iterations: Any) -> Answer:
         """Of what the library calls `solved` and, where there is no answer, `bad`."""
         status: Status = "solved" if found == self.solved else "infeasible" if found in self.bad else "unfinished"
         return Answer(np.array(z), y, status, int(iterations))
+
+
+def _hopeless(qp: Qp) -> bool:
+    return not ((qp.low <= qp.high).all() and np.isfinite(qp.q).all() and np.isfinite(qp.A.data).all())
+
+
+def _mended(qp: Qp) -> Qp:
+    """One of that pattern which every library takes."""
+    A = sp.csc_matrix((np.nan_to_num(qp.A.data, posinf=0.0, neginf=0.0), qp.A.indices, qp.A.indptr), shape=qp.A.shape)
+    low, high = (np.where(np.isnan(e), 0.0, e) for e in (np.fmin(qp.low, qp.high), np.fmax(qp.low, qp.high)))
+    return Qp(qp.P, np.nan_to_num(qp.q, posinf=0.0, neginf=0.0), A, low, high)
 
 
 @final
@@ -69,7 +98,7 @@ class Osqp(QpSolver):
     name, solved, bad = "osqp", 1, (3, 4)
     MOST = 60  # beyond it an interior point method is sooner there
 
-    def __init__(self, qp: Qp, tolerance: float, rho: float = 0.1, alpha: float = 1.6) -> None:
+    def _set_up(self, qp: Qp, tolerance: float, rho: float = 0.1, alpha: float = 1.6) -> None:
         self.osqp = _library("osqp").OSQP()
         # An adaptive ρ would make an answer depend on what was solved before.
         self.osqp.setup(
@@ -77,14 +106,14 @@ class Osqp(QpSolver):
             alpha=alpha, check_termination=5, polishing=False, warm_starting=True, scaling=10,
         )  # fmt: skip
         # What is updated is scaled by other roundings than what is set up.
-        self.update(qp)
+        self._update(qp, False)
 
-    def update(self, qp: Qp, varied: bool = False) -> None:
+    def _update(self, qp: Qp, varied: bool) -> None:
         if varied:
             self.osqp.update(Ax=qp.A.data)
         self.osqp.update(q=qp.q, l=qp.low, u=qp.high)
 
-    def solve(self, z: Array | None = None, y: Array | None = None) -> Answer:
+    def _solve(self, z: Array | None, y: Array | None) -> Answer:
         if z is not None:
             self.osqp.warm_start(x=z, y=y)
         found = self.osqp.solve(raise_error=False)
@@ -98,7 +127,7 @@ class Piqp(QpSolver):
     name = "piqp"
     MOST = 60  # it takes 10, or is on the edge of what is feasible
 
-    def __init__(self, qp: Qp, tolerance: float) -> None:
+    def _set_up(self, qp: Qp, tolerance: float) -> None:
         piqp = _library("piqp")
         P, q, A, low, high = qp
         self.equal = low == high
@@ -118,7 +147,7 @@ class Piqp(QpSolver):
         self.solved = piqp.PIQP_SOLVED
         self.bad = (piqp.PIQP_PRIMAL_INFEASIBLE, piqp.PIQP_DUAL_INFEASIBLE)
 
-    def update(self, qp: Qp, varied: bool = False) -> None:
+    def _update(self, qp: Qp, varied: bool) -> None:
         e, rest = self.equal, self.rest
         parts: dict[str, Any] = {}
         for name, part, where in self.parts if varied else ():
@@ -126,7 +155,7 @@ class Piqp(QpSolver):
             parts[name] = part
         self.piqp.update(c=qp.q, b=qp.low[e], h_l=qp.low[rest], h_u=qp.high[rest], **parts)
 
-    def solve(self, z: Array | None = None, y: Array | None = None) -> Answer:
+    def _solve(self, z: Array | None, y: Array | None) -> Answer:
         found = self.piqp.solve()
         r = self.piqp.result
         dual = np.zeros(len(self.equal))
@@ -141,7 +170,7 @@ class Clarabel(QpSolver):
 
     name = "clarabel"
 
-    def __init__(self, qp: Qp, tolerance: float) -> None:
+    def _set_up(self, qp: Qp, tolerance: float) -> None:
         clarabel = _library("clarabel")
         self.equal = qp.low == qp.high
         settings = clarabel.DefaultSettings()
@@ -163,11 +192,11 @@ class Clarabel(QpSolver):
         e = self.equal
         return np.asarray(np.clip(np.concatenate([qp.low[e], qp.high[~e], -qp.low[~e]]), -1e6, 1e6))
 
-    def update(self, qp: Qp, varied: bool = False) -> None:
+    def _update(self, qp: Qp, varied: bool) -> None:
         rows = {"A": self._rows(qp.A).data} if varied else {}
         self.clarabel.update(q=qp.q, b=self._right(qp), **rows)
 
-    def solve(self, z: Array | None = None, y: Array | None = None) -> Answer:
+    def _solve(self, z: Array | None, y: Array | None) -> Answer:
         found = self.clarabel.solve()
         e, dual = int(self.equal.sum()), np.zeros(len(self.equal))
         got = np.array(found.z)

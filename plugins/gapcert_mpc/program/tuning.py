@@ -240,7 +240,7 @@ def _runs(program: Program, aim: Array, rng: np.random.Generator) -> list[_Seen]
 
 def _work(program: Program, seen: list[_Seen], dear: Array, rho: float, alpha: float, most: float) -> float:
     """Iterations over the states seen, each from the plan before; where they are too many, the other method's are added."""
-    solver = Osqp(program.qp, program.tolerance, rho, alpha)
+    solver = Osqp(program.qp, program.tolerance, rho=rho, alpha=alpha)
     z, y, *none = program.shifted()
     total = 0.0
     for s, other in zip(seen, dear.tolist(), strict=True):

@@ -263,6 +263,8 @@ class System(ABC):
     def _options(self, n: int, given: Mapping[str, Any]) -> dict[str, Any]:
         """The options of `step` that are given, checked, and the hidden state by default."""
         options = {k: v for k, v in given.items() if v is not None}
+        if not options and "hidden" not in self.capabilities:
+            return options
         if undeclared := [k for k in options if k not in self.capabilities]:
             can = ", ".join(sorted(self.capabilities)) or "none"
             raise UsageError(f"{type(self).__name__}: option '{undeclared[0]}' is not declared (capabilities: {can})")
