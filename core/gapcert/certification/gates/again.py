@@ -23,15 +23,17 @@ from gapcert.numerics.errors import UsageError
 @final
 @dataclass(frozen=True)
 class InCalls:
-    """r(z), of which f̂ is asked half in calls of 1, 2, …, 64, 1, … rows, and half in one."""
+    """r(z), of which f̂ is asked half in calls of 1, 2, …, 64, 1, … rows, a quarter in growing ones, and the rest in one."""
 
     backend: System
     model: Model
 
     def __call__(self, z: Array) -> Array:
         x, u = np.ascontiguousarray(z[:, : self.model.nx]), np.ascontiguousarray(z[:, self.model.nx :])
-        cuts = np.cumsum(np.resize(np.arange(1, THRESHOLDS.small_call + 1), len(z)))
-        each = np.split(np.arange(len(z)), cuts[cuts <= min(len(z) // 2, THRESHOLDS.small_calls_rows)])
+        small = np.cumsum(np.resize(np.arange(1, THRESHOLDS.small_call + 1), len(z)))
+        small = small[small <= min(len(z) // 2, THRESHOLDS.small_calls_rows)]
+        grown = small[-1:] + np.cumsum(THRESHOLDS.small_call * 1.4 ** np.arange(1, 40)).astype(int)
+        each = np.split(np.arange(len(z)), [*small, *grown[grown <= small[-1:] + len(z) // 4]])
         after = np.concatenate([self.backend.step(x[rows], u[rows]).x for rows in each])
         return difference(self.model.states, after, self.model.step(x, u).x)
 

@@ -87,7 +87,7 @@ def purity(
         )
     copied = ("asked of a fresh copy", slice(None), rows.of(pickle.loads(pickle.dumps(system))))
     d = 0.0
-    for what, index, answer in itertools.chain(contexts(system, rows, seed), [copied], _held(system, rows, first)):
+    for what, index, answer in itertools.chain(contexts(system, rows, seed), [copied], held(system, rows, first)):
         d = max(d, _same(role, system, rows, first, index, answer, what))
         tell(what)
     said, there = "repeated and permuted queries, close neighbours, other sizes of call", _elsewhere(system, rows, executor, seed)
@@ -132,7 +132,7 @@ def contexts(system: System, rows: Queries, seed: int) -> Iterator[tuple[str, An
         first -= size
 
 
-def _held(system: System, rows: Queries, first: Step) -> Iterator[tuple[str, Any, Step]]:
+def held(system: System, rows: Queries, first: Step) -> Iterator[tuple[str, Any, Step]]:
     """One row asked over and over: an engine that puts slow bodies to sleep counts, over half a second to two, while it is."""
     times = min(THRESHOLDS.held_periods, max(4, math.ceil(2.5 / system.period)))
     move = np.abs(difference(system.states, first.x, rows.x)).sum(axis=1)
