@@ -348,7 +348,8 @@ def _claim(e: Evidence) -> str:
         return f"the audit's points are {drawn}, and the claim states '{e.data['claim']['distribution']}'"
     if kind == "deterministic" and e.data["route"] == "calibrate":
         return "a deterministic claim rests on a calibration"
-    if kind == "deterministic" and (hidden or (e.arrays["resolution"] > e.rounding).any()):
+    matters = bool(hidden) and not e.data["hidden"]["harmless"]
+    if kind == "deterministic" and (matters or (e.arrays["resolution"] > e.rounding).any()):
         return "a deterministic claim rests on drawn hidden states"
     if kind == "deterministic" and provenance == "estimated":
         return "a deterministic claim rests on estimated constants"

@@ -19,6 +19,7 @@ import numpy as np
 from gapcert.certification.certificate import Audit, Certificate, Ledger, Record, figures, gap_digest, points_refute
 from gapcert.certification.compatibility import refuse, unpaired
 from gapcert.certification.gates import entry, hidden_state
+from gapcert.certification.gates.again import InCalls, again
 from gapcert.certification.gates.augment import widen
 from gapcert.certification.gates.circle import repeating
 from gapcert.certification.gates.hidden_state import Gate, HiddenPlan
@@ -101,9 +102,12 @@ def certify(
         store = Store(Path(folder) / "samples", Residual(gate.system, model), key, pools, sampling.chunk, emit)
         book = Ledger(Path(folder).parent / "ledger.json" if ledger is None else Path(ledger))
         problem = measure(asked, store, gate)  # r at z_1, …, z_N, and constants of g
-        gap, problem, record = fitted(asked, problem, store, book)  # l ≤ r ≤ u, so |r| ≤ γ, on Z
-        audited = audit(gap, problem, asked, store, book, record)  # attacked at points that no fit has seen
-    return conclude(asked, gap, problem, record, audited, gate, store)  # what may be said
+        strong = stricter(store, gate, domain)
+        gap, problem, record = fitted(asked, problem, strong, book)  # l ≤ r ≤ u, so |r| ≤ γ, on Z
+        audited = audit(gap, problem, asked, strong, book, record)  # attacked at points that no fit has seen
+    told = ((store.residual, problem.samples.z, problem.samples.r), (strong.residual, audited.z, audited.r))
+    gate = replace(gate, purity=f"{gate.purity}; {again(told, domain, problem.arithmetic, seed)}")
+    return conclude(asked, gap, problem, record, audited, gate, strong)  # what may be said
 
 
 @final
@@ -137,6 +141,13 @@ def _sampling(given: Sampling | None, family: GapFamily, domain: Domain, bounded
 def digest(model: Model, backend: System, domain: Domain) -> str:
     """Identity of the question: model, backend and domain alone."""
     return json_digest(model.digest(), backend.digest(), domain.digest_data())
+
+
+def stricter(store: Store, gate: Gate, domain: Domain) -> Store:
+    """Where points come from that no fit has seen: asked in calls of many sizes, harmless hidden state drawn."""
+    system, model = gate.audited or gate.system, store.residual.model
+    residual: Any = InCalls(system, model)
+    return replace(store, residual=residual, key=digest(model, system, domain) if gate.audited else store.key)
 
 
 def measure(question: Question, store: Store, gate: Gate) -> GapProblem:
@@ -281,7 +292,8 @@ def conclude(
     route, request, model = question.route, question.request, question.model
     refuted = route.refuted(problem, gap)
     gate = hidden_state.attacked(gate, gap, problem, model, store.emit)
-    attacked = attack(gap, store.residual, problem.domain, request.attack, problem.seed, store.emit) if request.attack else {}
+    whole, n = Residual(store.residual.backend, model), request.attack
+    attacked = attack(gap, whole, problem.domain, n, problem.seed, store.emit) if n else {}
     if record is not None and attacked:
         attacked["allowed"] = record.allowed(request.attack, request.epsilon)
     rests = route.sentences(Findings(problem, gap, record, audited, model, gate, refuted))

@@ -55,7 +55,7 @@ def enter(
         probed = purity(role, system, domain, executor, seed, told(role))
     gate = open_gate(model, backend, domain, plan, seed, told("hidden state,"))
     pulse(next(probes), text="do inputs arrive?")
-    if claim == "deterministic" and gate.distribution:
+    if claim == "deterministic" and gate.probe is not None and not gate.probe.harmless:
         raise UsageError(
             f"certificate.claim: deterministic cannot be had with hidden: {gate.plan.mode}, which estimates or leaves out what "
             f"hidden state does ({', '.join(gate.names)}); use hidden: augment, or ask for a statistical claim"

@@ -74,32 +74,43 @@ class Pool:
 
 
 def visited(
-    system: System, domain: Domain, runs: int, steps: int, seed: int, tell: Callable[[int], None] = lambda steps: None
+    system: System,
+    domain: Domain,
+    runs: int,
+    steps: int,
+    seed: int,
+    tell: Callable[[int], None] = lambda steps: None,
+    long: bool = False,
 ) -> Pool:
     """`runs` rollouts from random states, hidden handed on from the declared default, a fresh random input in each step.
 
     Inputs are drawn such that (x, u) lies in the domain, relations included; a run that leaves it starts anew. The first
     quarter of the steps is left out: there the hidden state still remembers a start that nothing led to. tell: called with
-    the steps that are done.
+    the steps that are done. long: nothing is left out, inputs are held for 1, 2, 4, … 128 steps, and a run that starts anew
+    hands its hidden state on, so that what adds up over all steps does.
     """
     rng = np.random.default_rng([seed, 0x41DD])
     x, u = (np.ascontiguousarray(part) for part in domain.split(domain.draw(runs, rng)))
-    hidden, age = default(system, runs), np.zeros(runs, dtype=int)
+    hidden, age, hold = default(system, runs), np.zeros(runs, dtype=int), 2 ** (np.arange(runs) % 8)
     xs, hs = [], []
     for k in range(steps):
         tell(k)
         out = system.step(x, u, hidden=hidden)
         assert out.hidden is not None, "a system with hidden state hands it on"
         x, hidden, age = out.x, out.hidden, age + 1
-        u, inside = inputs(domain, x, rng)
-        kept = inside & (age > steps // 4)
+        before, (u, inside) = u, inputs(domain, x, rng)
+        if long:
+            held = (age % hold > 0) & domain.contains(np.hstack([x, before]))
+            u = np.where(held[:, None], before, u)
+        kept = inside & (long | (age > steps // 4))
         xs.append(x[kept])
         hs.append(hidden[kept])
         if (lost := ~inside).any():
             fresh = domain.draw(int(lost.sum()), rng)
             x, u, hidden, age = x.copy(), u.copy(), hidden.copy(), age.copy()
             x[lost], u[lost] = domain.split(fresh)
-            hidden[lost], age[lost] = default(system, len(fresh)), 0
+            if not long:
+                hidden[lost], age[lost] = default(system, len(fresh)), 0
     return Pool(np.concatenate(xs), np.concatenate(hs))
 
 
@@ -256,6 +267,41 @@ class Visited(Law):
         for array in (self.pool.x, self.pool.h, self.scale):
             h.update(np.ascontiguousarray(array).tobytes())
         return h.hexdigest()
+
+
+@final
+class Around(Law):
+    """Of hidden state that seemed harmless: its default, as long rollouts leave it, or moved from its default, a third each."""
+
+    def __init__(self, system: System, domain: Domain, ranges: Mapping[str, Range], seed: int) -> None:
+        met = visited(system, domain, THRESHOLDS.harmless_runs, THRESHOLDS.harmless_steps, seed, long=True).h
+        rng, base = np.random.default_rng([seed, 0x41E0]), default(system, max(1, len(met)))
+        far = base + rng.random(base.shape) * (moved(system, len(base), rng, ranges) - base)
+        for spec, part in zip(system.hidden, columns(system.hidden), strict=True):
+            if spec.kind == "quaternion":
+                far[:, part] /= np.linalg.norm(far[:, part], axis=1, keepdims=True)
+        self.pool = np.vstack([base, met if len(met) else base, far])
+
+    def draw(self, key: Keys, x: Array) -> Array:
+        return np.asarray(self.pool[(uniforms(key, 1)[:, 0] * len(self.pool)).astype(np.intp)])
+
+    def extremes(self, x: Array, count: int) -> list[Array]:
+        return [np.tile(h, (len(x), 1)) for h in self.pool[:: max(1, len(self.pool) // count)]]
+
+    def outside(self, hidden: Array) -> Bools:
+        return np.asarray(((hidden < self.pool.min(axis=0)) | (hidden > self.pool.max(axis=0))).any(axis=1))
+
+    def describe(self) -> str:
+        return (
+            f"in equal parts at its default, as rollouts of up to {THRESHOLDS.harmless_steps} steps leave it, and moved from its "
+            f"default as the probe does"
+        )
+
+    def follows(self) -> str:
+        return ""
+
+    def digest(self) -> str:
+        return json_digest("around", hashlib.sha256(self.pool.tobytes()).hexdigest())
 
 
 @final

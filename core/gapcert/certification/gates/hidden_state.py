@@ -10,6 +10,7 @@ import numpy as np
 
 from gapcert.certification.gates.augment import Augmented
 from gapcert.certification.gates.hidden_distribution import (
+    Around,
     HiddenDraws,
     Law,
     Pool,
@@ -96,6 +97,7 @@ class Gate:
     """What the gates found: `purity` and `turns` in words, `warnings`, and the branch that was taken with hidden state.
 
     `system` is what is sampled, `bound` (nx,) the spread that acts as further resolution; it cost `spent` transitions.
+    `audited`, if set, is asked by the audit instead: hidden state that a probe found harmless is drawn there all the same.
     """
 
     plan: HiddenPlan
@@ -110,12 +112,14 @@ class Gate:
     warnings: tuple[str, ...] = ()
     spent: int = 0
     attack: Mapping[str, Any] = field(default_factory=dict)
+    audited: System | None = None
 
     @property
     def distribution(self) -> str:
-        """What the audit's distribution says of the hidden state; empty where it does not matter."""
-        if self.law is not None:
-            return f", hidden state {self.law.describe()}"
+        """What the audit's distribution says of the hidden state; empty where there is none."""
+        law = self.audited.law if isinstance(self.audited, HiddenDraws) else self.law
+        if law is not None:
+            return f", hidden state {law.describe()}"
         return ", hidden state at its default" if self.probe is not None and not self.probe.harmless else ""
 
     def summary(self) -> dict[str, Any]:
@@ -191,7 +195,12 @@ def open_gate(
     pool = visited(backend, domain, THRESHOLDS.hidden_runs, steps, seed, lambda k: tell(f"rollouts, step {k + 1} of {steps}"))
     tell("moved at random points")
     probed = probe(Residual(backend, model), domain, plan.ranges, pool, seed)
-    if probed.harmless or plan.mode == "default":
+    if probed.harmless:
+        tell("harmless so far, and drawn in the audit")
+        drawn = HiddenDraws(backend, Around(backend, domain, plan.ranges, seed + 3), seed)
+        spent = THRESHOLDS.harmless_runs * THRESHOLDS.harmless_steps
+        return Gate(plan, backend, states, augmented or names, none, probed, spent=spent, audited=drawn)
+    if plan.mode == "default":
         return Gate(plan, backend, states, augmented or names, none, probed)
     if plan.mode != "sample":
         raise UsageError(_refusal(probed, plan.mode == "augment", states, backend))
