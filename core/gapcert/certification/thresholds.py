@@ -36,6 +36,16 @@ class Thresholds:
     held_periods: int = chosen(512, "at most, that one row is asked in a row: a counter in a system shows by then")
     response_error: float = chosen(0.1, "relative, between what an input moves in f̂ and in f: a warning, no refusal")
     response_rows: int = chosen(16, "states at which an input is moved from end to end")
+    # fingerprint
+    question_points: int = threshold(64, "of Z, as the design has it: what f and f̂ answer there makes a question")
+    question_box: int = chosen(512, "of the box around Z, of which Z has the same in every spelling")
+    question_diagonal: int = chosen(8, "of the points, at one share of every axis: what differs there need not be ordered")
+    question_orders: int = chosen(720, "of axes with equal ranges that are tried: those of six")
+    question_range: float = threshold(1e-9, "of the width, as the design has it: closer ranges are one")
+    question_draws: int = chosen(16, "of noise at each point")
+    question_noise: float = threshold(2.0, "deviations, by the formula: means of 16 draws at 64 points differ by less, to 1e-7")
+    question_spread: float = threshold(0.2, "by the formula, six deviations of a ratio of spreads over 1024 draws")
+    question_shared: float = chosen(0.05, "of the transitions of two recordings that are one question")
     # samples
     spread_grid: int = chosen(300, "points of a grid where nobody asks for another")
     refinement_rounds: int = chosen(8, "at most 9, since names of rounds are sorted as texts")
