@@ -149,17 +149,23 @@ class Fingerprint:
         return Known(own, inside, len(diagonal), z[:, axes], values[..., states], e[states], noise[states], content), axes
 
     def _counts(self, z: Array, values: Array, e: Array) -> Bools:
-        """(nz,): does the axis count? One may be added that nothing else depends on, and a state then by itself has no gap."""
-        nx, related = self.domain.nx, self.domain.zone.matrix.any(axis=0)
+        """(nz,): does the axis count? One may be added that nothing else depends on, and a state then by itself has no gap.
+
+        Where no state does, all do.
+        """
+        nx, zone = self.domain.nx, self.domain.zone
+        cuts = np.maximum(zone.matrix * zone.low, zone.matrix * zone.high).sum(axis=1) > zone.bounds
+        related = zone.matrix[cuts].any(axis=0)
         moved = np.zeros((len(related), nx), dtype=bool)
         for j in range(len(related)):
             other = z.copy()
             other[:, j] = np.roll(z[:, j], 1)
-            moved[j] = related[j] or (np.abs(self._answers(other)[0] - values) > 4 * e).any(axis=(0, 1))
+            other = self._si(self.domain.reach(self._own(z), self._own(other)))
+            moved[j] = (np.abs(self._answers(other)[0] - values) > 4 * e).any(axis=(0, 1))
         moved[np.arange(nx), np.arange(nx)] = False
         out = related | moved.any(axis=1)
         out[:nx] |= moved.any(axis=0) | (np.abs(values[1] - values[0]) > 4 * e).any(axis=0)
-        return np.asarray(out)
+        return np.asarray(out | ~out[:nx].any())
 
     def _answers(self, z: Array) -> tuple[Array, Array]:
         """(f, f̂) at points z (n, nz), (2, n, nx), and the standard deviation of f̂'s draws (nx,); of draws the mean."""
