@@ -9,16 +9,17 @@ from gapcert.lazy import LazyPackage, homes
 _HOME = homes(
     {
         "gapcert.certification.certificate": (
-            "Audit Band Certificate Ledger Record SavedStatement StateEvidence Statement domain_data figures gap_digest "
-            "saved_digest"
+            "Audit Band Certificate Record SavedStatement StateEvidence Statement domain_data figures gap_digest saved_digest"
         ),
-        "gapcert.certification.certify": "digest predictor_of",
+        "gapcert.certification.certify": "predictor_of",
         "gapcert.certification.compatibility": "unmatched unpaired",
         "gapcert.certification.coordinates": "Coordinates RelativeModel in_words",
         "gapcert.certification.declaration": "Declaration",
+        "gapcert.certification.fingerprint": "Fingerprint digest",
         "gapcert.certification.gates.augment": "forgets widen",
         "gapcert.certification.gates.hidden_distribution": "Law beginning",
         "gapcert.certification.gates.hidden_state": "Gate",
+        "gapcert.certification.ledger": "Entry Ledger",
         "gapcert.certification.refutation": "Trails follow",
         "gapcert.certification.routes": "Findings Request Route",
         "gapcert.certification.samples.executors": "processes",
@@ -29,7 +30,7 @@ _HOME = homes(
         "gapcert.contracts.controllers.policies": "ANYWHERE POLICIES Policy known",
         "gapcert.contracts.data.effect": "Effect EffectParameter position site_units",
         "gapcert.contracts.data.recording": "SHORTEST Hold Reader Recording Trajectory as_numbers first_text seconds",
-        "gapcert.contracts.data.units": "magnitude pretty shown stated_units without_units",
+        "gapcert.contracts.data.units": "base magnitude pretty shown stated_units without_units",
         "gapcert.contracts.gaps.claim": "Claim beta_of",
         "gapcert.contracts.gaps.gap": "FitRoute GapFamily GapFunction GapProblem",
         "gapcert.contracts.gaps.lipschitz": "LipschitzBound LipschitzEstimator LipschitzProblem Provenance Residual",
@@ -56,7 +57,7 @@ _HOME = homes(
         "gapcert.numerics.atomic_files": "DAMAGE damage_told npz_bytes write_atomic",
         "gapcert.numerics.constraint_zone": "Relation Zone grid_at grid_size lattice",
         "gapcert.numerics.counter_rng": "keys normals uniforms",
-        "gapcert.numerics.digest": "identity json_digest located",
+        "gapcert.numerics.digest": "arrays_digest identity json_digest located",
         "gapcert.numerics.errors": "GapcertError MissingDependency NoStart SpecError Undecided UsageError clipped harmless",
         "gapcert.numerics.interpolation": "cells cut highest interpolate joined on_curvature ranges rounding slopes worst",
         "gapcert.numerics.intervals": "Interval",

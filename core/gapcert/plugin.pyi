@@ -1,7 +1,6 @@
 from gapcert.certification.certificate import Audit as Audit
 from gapcert.certification.certificate import Band as Band
 from gapcert.certification.certificate import Certificate as Certificate
-from gapcert.certification.certificate import Ledger as Ledger
 from gapcert.certification.certificate import Record as Record
 from gapcert.certification.certificate import SavedStatement as SavedStatement
 from gapcert.certification.certificate import StateEvidence as StateEvidence
@@ -10,7 +9,6 @@ from gapcert.certification.certificate import domain_data as domain_data
 from gapcert.certification.certificate import figures as figures
 from gapcert.certification.certificate import gap_digest as gap_digest
 from gapcert.certification.certificate import saved_digest as saved_digest
-from gapcert.certification.certify import digest as digest
 from gapcert.certification.certify import predictor_of as predictor_of
 from gapcert.certification.compatibility import unmatched as unmatched
 from gapcert.certification.compatibility import unpaired as unpaired
@@ -18,11 +16,15 @@ from gapcert.certification.coordinates import Coordinates as Coordinates
 from gapcert.certification.coordinates import RelativeModel as RelativeModel
 from gapcert.certification.coordinates import in_words as in_words
 from gapcert.certification.declaration import Declaration as Declaration
+from gapcert.certification.fingerprint import Fingerprint as Fingerprint
+from gapcert.certification.fingerprint import digest as digest
 from gapcert.certification.gates.augment import forgets as forgets
 from gapcert.certification.gates.augment import widen as widen
 from gapcert.certification.gates.hidden_distribution import Law as Law
 from gapcert.certification.gates.hidden_distribution import beginning as beginning
 from gapcert.certification.gates.hidden_state import Gate as Gate
+from gapcert.certification.ledger import Entry as Entry
+from gapcert.certification.ledger import Ledger as Ledger
 from gapcert.certification.refutation import Trails as Trails
 from gapcert.certification.refutation import follow as follow
 from gapcert.certification.routes import Findings as Findings
@@ -54,6 +56,7 @@ from gapcert.contracts.data.recording import Trajectory as Trajectory
 from gapcert.contracts.data.recording import as_numbers as as_numbers
 from gapcert.contracts.data.recording import first_text as first_text
 from gapcert.contracts.data.recording import seconds as seconds
+from gapcert.contracts.data.units import base as base
 from gapcert.contracts.data.units import magnitude as magnitude
 from gapcert.contracts.data.units import pretty as pretty
 from gapcert.contracts.data.units import shown as shown
@@ -151,6 +154,7 @@ from gapcert.numerics.constraint_zone import lattice as lattice
 from gapcert.numerics.counter_rng import keys as keys
 from gapcert.numerics.counter_rng import normals as normals
 from gapcert.numerics.counter_rng import uniforms as uniforms
+from gapcert.numerics.digest import arrays_digest as arrays_digest
 from gapcert.numerics.digest import identity as identity
 from gapcert.numerics.digest import json_digest as json_digest
 from gapcert.numerics.digest import located as located

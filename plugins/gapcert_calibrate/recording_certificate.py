@@ -17,6 +17,7 @@ from gapcert.plugin import (
     Band,
     Claim,
     Domain,
+    Entry,
     GapFamily,
     GapProblem,
     Ints,
@@ -45,6 +46,7 @@ from .route import CalibratedGap, NoConstants, constant, ends, scale_of
 
 CALLER = "calibration"
 FIT = 1 / 3  # the share of windows that a fit is given
+_SKETCH = 64  # hashes of transitions that stand for a recording: enough to see what two have in common; chosen, not measured
 _FITTED = 300  # transitions that a fit is given: neighbours in time say nearly the same, and scores are made again with each
 
 
@@ -117,8 +119,8 @@ class CalibratedRecording(SavedStatement):
     """A band that holds for all transitions of a further window, with probability 1 − ε on average over calibrations.
 
     `units` windows met Z; those of `fit` gave the band, those of `held` its widening: score · scale, (nx,), with the score of
-    `rank` among their `scores`. `states` are figures over the transitions of the held windows. number: which calibration on
-    these measurements it is, where a ledger counts them.
+    `rank` among their `scores`. `states` are figures over the transitions of the held windows. entry: which calibration on
+    these measurements it is, where a book counts them.
     """
 
     gap: CalibratedGap
@@ -134,7 +136,7 @@ class CalibratedRecording(SavedStatement):
     score: float
     scores: Array
     states: Mapping[str, StateEvidence]
-    number: int | None = None
+    entry: Entry | None = None
     versions: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -171,12 +173,12 @@ class CalibratedRecording(SavedStatement):
                 f"{self.model.period:g} s (the next row is late, early or missing, a value is missing, or the input moved); "
                 f"the claim is about the others"
             )
-        if self.number is not None and self.number > 1:
+        if self.entry is not None and self.entry.k > 1:
             said.append(
-                f"this is calibration {self.number} on the same measurements; fresh ones cannot be drawn from a recording, so "
+                f"this is calibration {self.entry.k} on the same measurements; fresh ones cannot be drawn from a recording, so "
                 f"that one which was chosen by its figures claims too much"
             )
-        return said
+        return [*said, *(() if self.entry is None else self.entry.warnings)]
 
     def digest(self) -> str:
         """Identity of the band and of its claim."""
@@ -201,7 +203,7 @@ class CalibratedRecording(SavedStatement):
             "samples": {"bound": len(self.problem.samples), "calibration": len(self.held.z)},
             "vacuous": self.vacuous,
             "lipschitz": self.problem.lipschitz.summary(self.domain.axes),
-            "recording": measured | ({} if self.number is None else {"number": self.number}),
+            "recording": measured | ({} if self.entry is None else self.entry.summary()),
             **({"warnings": said} if (said := self.warnings) else {}),
         }
 
@@ -269,6 +271,18 @@ def calibrate_recording(
     return CalibratedRecording(
         band, problem, model, claim, said, units, own, held, scale, rank, score, each, states, versions=versions
     )
+
+
+def content(made: CalibratedRecording) -> tuple[int, ...]:
+    """What stands for the measurements behind a calibration: the smallest hashes of its transitions, in whatever order, names and
+    units these were written. Two recordings share as many of these as of all (Broder 1997)."""
+    low, width = made.domain.low, made.domain.width
+    z, r = (np.concatenate([getattr(part, k) for part in (made.fit, made.held)]) for k in ("z", "r"))
+    # Shares of the ranges, so that units do not count, sorted, so that the order of the axes does not; and rounded to a number that
+    # no logger rounds to, so that few lie between two.
+    shares = np.hstack([np.sort((z - low) / width, axis=1), np.sort(r / width[: r.shape[1]], axis=1)])
+    rows = np.round(shares * 790_569.4).astype(np.int64)
+    return tuple(sorted({int(hashlib.sha256(row.tobytes()).hexdigest()[:16], 16) for row in rows})[:_SKETCH])
 
 
 def _dealt(units: int, fit: float, violation: float, beta: float | None, window: float | None) -> int:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from decimal import Decimal
 from typing import Any
 
 import numpy as np
 
-from gapcert.plugin import Array, Interval, UsageError, order_statistics
+from gapcert.plugin import Array, Interval, UsageError, arrays_digest, order_statistics
 
 from .evidence import Evidence, predictor, uncalibrated
 
@@ -30,6 +31,31 @@ def noise(e: Evidence) -> str:
         return ""
     repeats = made["repeats"]
     return order_statistics.NOISE if repeats == 1 else order_statistics.NOISE_OF.format(repeats)
+
+
+def draws(e: Evidence, stream: str) -> np.random.Generator:
+    """What the points of audit or calibration are drawn from; without an entry in the book, by the rule from before."""
+    audit = e.data["audit"]
+    book = {k: audit["book"][k] for k in ("question", "audited")} if "book" in audit else {}
+    return order_statistics.drawing(e.data["seed"], audit["number"], stream, **book)
+
+
+def miscounted(e: Evidence) -> str:
+    """ "" where the entry in the book, if there is one, is of the stored function, and of the claim that was asked for."""
+    audit, made = e.data["audit"], e.data.get("calibration")
+    if "book" not in audit:
+        return ""
+    key = e.stored(f"audit-{audit['number']}")[0]["key"]
+    own = {
+        k[4:]: v for k, v in e.arrays.items() if k.startswith("gap.") and (made is None or not k.startswith("gap.calibrated."))
+    }
+    text = arrays_digest(own, e.data["family"], e.data["form"], e.data["seed"])
+    text = f"{text}:{key}:{audit['epsilon']!r}:{audit['beta']!r}"
+    if made is not None:
+        text = f"calibrate:{text}:{made['exceedances']}:{made['repeats']}"
+    kind = "audit" if made is None else "calibration"
+    same = audit["book"]["audited"] == hashlib.sha256(text.encode()).hexdigest() and audit["book"]["kind"] == kind
+    return "" if same and audit["book"]["question"] else "the entry in the book is not of what was audited"
 
 
 def calibrated(e: Evidence) -> str | None:
@@ -60,12 +86,11 @@ def _points(e: Evidence, z: Array, all_z: list[Array]) -> str:
     if not (0 < epsilon < 1 and 0 < audit["beta"] < 1 and k >= 1):
         return f"ε = {epsilon}, β = {audit['beta']}, calibration {k} are no probabilities of a numbered calibration"
     try:
-        rng = np.random.default_rng([e.data["seed"], k, order_statistics.STREAM])
-        drawn = e.zone.draw(len(z), rng)
+        drawn = e.zone.draw(len(z), draws(e, "calibration"))
     except UsageError as error:
         return str(error)
     if not all(np.array_equal(drawn, other) for other in all_z):
-        return "other points were calibrated with than (seed, k) draws"
+        return "other points were calibrated with than its number and its seed draw"
     if made["points"] != len(z) or e.data["samples"]["calibration"] != len(z) * len(all_z):
         return f"{len(z)} points are stored, {made['points']} and {e.data['samples']['calibration']} are stated"
     if m < 0 or order_statistics.missed(m, len(z), epsilon) > Decimal(audit["beta"] / 2**k):

@@ -19,7 +19,7 @@ import numpy as np
 from gapcert.plugin import DAMAGE, Array, Interval, UsageError, on_curvature
 
 from . import statements as stated
-from .calibration import calibrated, further, names, noise, windows
+from .calibration import calibrated, draws, further, miscounted, names, noise, windows
 from .evidence import Evidence, Part, another, bounds, distance, load, predictor
 from .margin import margin
 from .proofs import bent, dominates, exceeds, follows
@@ -150,6 +150,11 @@ def _trusted(e: Evidence) -> list[str]:
         )
     count = e.data["samples"]["bound"] if e.reduced else 0
     told = {
+        "The audit's number is what the book beside the run folders counted; the book was not looked at.": "book"
+        in e.data["audit"],
+        "The audit's points were drawn by the rule before the book's format 2, from seed and number: a fit could know them.": (
+            "book" not in e.data["audit"]
+        ),
         "Hidden state was probed, drawn and attacked as stated: its values are not stored.": e.data.get("hidden"),
         "The texts of the relations say what their coefficients do.": e.zone.relations,
         "The declared symmetry holds beyond the pairs that were looked at.": e.data.get("symmetry"),
@@ -284,13 +289,15 @@ def _function(e: Evidence) -> str:
 
 
 def _drawn(e: Evidence) -> str:
+    """The points are those of the audit's entry in the book, which names this very function."""
+    if text := miscounted(e):
+        return text
     z, _ = e.audit
-    rng = np.random.default_rng([e.data["seed"], e.data["audit"]["number"]])
     try:
-        drawn = e.zone.draw(len(z), rng)
+        drawn = e.zone.draw(len(z), draws(e, "audit"))
     except UsageError as error:
         return str(error)
-    return "" if np.array_equal(z, drawn) else "other points were audited than (seed, k) draws"
+    return "" if np.array_equal(z, drawn) else "other points were audited than its number and its seed draw"
 
 
 def _within(e: Evidence) -> str:

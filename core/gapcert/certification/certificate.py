@@ -14,6 +14,7 @@ import numpy as np
 
 import gapcert
 from gapcert.certification.gates.hidden_state import Gate
+from gapcert.certification.ledger import Entry
 from gapcert.certification.refutation import warnings
 from gapcert.contracts.gaps.claim import Claim
 from gapcert.contracts.gaps.gap import GapFunction, GapProblem
@@ -24,52 +25,10 @@ from gapcert.contracts.systems.domain import Domain, Outside
 from gapcert.contracts.systems.system import Model, difference
 from gapcert.numerics.arrays import Array, Bools
 from gapcert.numerics.atomic_files import npz_bytes, write_atomic
-from gapcert.numerics.errors import UsageError
+from gapcert.numerics.digest import arrays_digest
 
 if TYPE_CHECKING:
     from gapcert.contracts.data.recording import Recording
-
-
-@final
-@dataclass(frozen=True)
-class Ledger:
-    """The audits of each question (model, backend, domain), in one JSON file beside the run folders.
-
-    Audit k = 1, 2, … of a question may spend β_k = β / 2^k, so that all together spend at most β. The same audited object
-    again is the same audit. An entry is written before the audit's points are drawn: an audit that was begun counts.
-    """
-
-    path: Path
-
-    def enter(self, question: str, audited: str) -> int:
-        """k of this audit; a new one is recorded under an exclusive lock."""
-        import fcntl
-
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        # Opened as it is: a lock has no content to be truncated, wherever a link may lead.
-        with open(self.path.with_suffix(".lock"), "a") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            book = self._book()
-            audits = book.setdefault(question, [])
-            if audited not in audits:
-                audits.append(audited)
-                write_atomic(self.path, json.dumps(book, indent=1).encode())
-            return audits.index(audited) + 1
-
-    def _book(self) -> dict[str, list[str]]:
-        """The audits of each question. A ledger that cannot be read is never begun anew: that would spend β twice."""
-        if not self.path.exists():
-            return {}
-        try:
-            book: dict[str, list[str]] = json.loads(self.path.read_text(encoding="utf-8"))
-            if not all(isinstance(a, str) for audits in book.values() for a in audits):
-                raise ValueError("it holds something else")
-        except (OSError, ValueError, AttributeError, TypeError, RecursionError) as error:
-            raise UsageError(
-                f"{self.path}: the ledger of audits cannot be read ({error}); expected the JSON that runs write; restore it, "
-                "or, if the count of audits may be lost, move it away, and run it again"
-            ) from None
-        return book
 
 
 @final
@@ -79,12 +38,17 @@ class Audit:
 
     z: Array
     r: Array
-    k: int
+    entry: Entry
     epsilon: float
     beta: float
     outside: Bools
     above: Bools
     limit: int = 0
+
+    @property
+    def k(self) -> int:
+        """Its number among those of the question, by which it spends β_k."""
+        return self.entry.k
 
     @property
     def violations(self) -> int:
@@ -191,8 +155,12 @@ def overpowered(gamma: Array, model: Model, domain: Domain, z: Array) -> list[fl
 class Record(ABC):
     """How a route came to its band, where that is no function of samples and constants alone: further points, say."""
 
-    k: int
-    """Number of the audit of this question, whose β it has spent."""
+    entry: Entry
+    """Where the book counts it: it has spent β_k of its number k."""
+
+    @property
+    def k(self) -> int:
+        return self.entry.k
 
     @property
     @abstractmethod
@@ -357,7 +325,7 @@ class Certificate(SavedStatement):
                 "gamma_violations": int(a.above.sum()),
                 "epsilon": a.epsilon,
                 "beta": a.beta,
-                "number": a.k,
+                **a.entry.summary(),
             },
             "vacuous": self.vacuous,
             "lipschitz": self.lipschitz.summary(self.domain.axes),
@@ -372,7 +340,11 @@ class Certificate(SavedStatement):
             out["attack"] = dict(self.attack)
         if (witness := a.witness(self.gap)) is not None:
             out["audit"]["witness"] = witness | {"at": {a.name: v for a, v in zip(self.domain.axes, witness["z"], strict=True)}}
-        said = [*(self.gate.warnings if self.gate is not None else ()), *warnings(self.lipschitz, self.domain.axes)]
+        said = [
+            *(self.gate.warnings if self.gate is not None else ()),
+            *warnings(self.lipschitz, self.domain.axes),
+            *a.entry.warnings,
+        ]
         hidden = self.gate.summary() if self.gate is not None else None
         out |= {k: v for k, v in (("hidden", hidden), ("warnings", said)) if v}
         return out
@@ -420,8 +392,5 @@ def saved_digest(folder: Path) -> str:
 
 
 def gap_digest(gap: GapFunction, problem: GapProblem) -> str:
-    """Identity of the audited object: the gap function's data, and the seed that draws the audit's points."""
-    h = hashlib.sha256(json.dumps([gap.family, dict(gap.form), problem.seed], sort_keys=True).encode())
-    for name, array in sorted(gap.arrays().items()):
-        h.update(name.encode() + np.ascontiguousarray(array).tobytes())
-    return h.hexdigest()
+    """Identity of the audited object: the gap function's data, and the seed that has a part in drawing the audit's points."""
+    return arrays_digest(gap.arrays(), gap.family, dict(gap.form), problem.seed)

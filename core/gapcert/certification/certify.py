@@ -11,18 +11,21 @@ import platform
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, final
 
 import numpy as np
 
-from gapcert.certification.certificate import Audit, Certificate, Ledger, Record, figures, gap_digest, points_refute
+from gapcert.certification.certificate import Audit, Certificate, Record, figures, gap_digest, points_refute
 from gapcert.certification.compatibility import refuse, unpaired
+from gapcert.certification.fingerprint import Fingerprint, digest
 from gapcert.certification.gates import entry, hidden_state
 from gapcert.certification.gates.again import InCalls, again
 from gapcert.certification.gates.augment import widen
 from gapcert.certification.gates.circle import repeating
 from gapcert.certification.gates.hidden_state import Gate, HiddenPlan
+from gapcert.certification.ledger import Ledger
 from gapcert.certification.refutation import watched
 from gapcert.certification.routes import Findings, Request, Route
 from gapcert.certification.samples.designs import AdaptiveSampling, GridSampling, LatticeSampling, Sampling, axes_of, refined
@@ -39,7 +42,6 @@ from gapcert.contracts.systems.arithmetic import named
 from gapcert.contracts.systems.domain import Domain, Points
 from gapcert.contracts.systems.system import Model, System
 from gapcert.numerics.arrays import Array, Bools
-from gapcert.numerics.digest import json_digest
 from gapcert.numerics.errors import UsageError
 from gapcert.version import __version__
 
@@ -60,7 +62,7 @@ def certify(
     seed: int = 0,
     folder: Path | str = "runs/certify",
     ledger: Path | str | None = None,
-    question: str | None = None,
+    question: Fingerprint | None = None,
     executor: Callable[[], Executor] = processes,
     emit: Emit = silent,
 ) -> Certificate:
@@ -71,8 +73,8 @@ def certify(
     `declared` takes γ as it is stated, without constants: samples, audit and attack may refute it, and its claim is `assumed`.
     `predictor` overrides the family's; a Model there is an extended model. `hidden`: what is done where hidden state matters
     (default: refuse); hidden states that the domain names become states. `symmetries`: axes along which the residual is
-    declared not to change; that is checked on pairs before it saves samples. Samples live in `folder`, the audit ledger in the
-    file `ledger` (default: beside the folder), under the digest `question` (default: that of model, backend and domain).
+    declared not to change; that is checked on pairs before it saves samples. Samples live in `folder`, the book of audits in the
+    file `ledger` (default: beside the folder), under `question` (default: that of model, backend and domain).
     UsageError where the ingredients cannot give the claim.
     """
     known = registry()
@@ -88,7 +90,7 @@ def certify(
         p, _ = widen(p, backend, domain)
     entry.contain(model, domain)
     model, backend = widen(model, backend, domain)
-    question = question or digest(model, backend, domain)
+    question = question or Fingerprint(model, backend, domain)
     name, drawn = by.prepared(request, family, backend, seed)
     fit = by if name == by.name else known.build("route", name)
     refuse(model, drawn, family, lipschitz, fit, request.claim, sampling.kept(domain) is not None)
@@ -107,7 +109,7 @@ def certify(
         audited = audit(gap, problem, asked, strong, book, record)  # attacked at points that no fit has seen
     told = ((store.residual, problem.samples.z, problem.samples.r), (strong.residual, audited.z, audited.r))
     gate = replace(gate, purity=f"{gate.purity}; {again(told, domain, problem.arithmetic, seed)}")
-    return conclude(asked, gap, problem, record, audited, gate, strong)  # what may be said
+    return conclude(asked, gap, problem, record, audited, gate, strong, book)  # what may be said
 
 
 @final
@@ -126,7 +128,7 @@ class Question:
     request: Request
     symmetries: Sequence[str]
     seed: int
-    digest: str
+    identity: Fingerprint
 
 
 def _sampling(given: Sampling | None, family: GapFamily, domain: Domain, bounded: bool) -> Sampling:
@@ -136,11 +138,6 @@ def _sampling(given: Sampling | None, family: GapFamily, domain: Domain, bounded
     if family.lattice and not isinstance(sampling, LatticeSampling):
         raise UsageError(f"gap: family '{family.name}' needs nodes of a lattice; use sampling: {{kind: lattice, budget: ...}}")
     return sampling
-
-
-def digest(model: Model, backend: System, domain: Domain) -> str:
-    """Identity of the question: model, backend and domain alone."""
-    return json_digest(model.digest(), backend.digest(), domain.digest_data())
 
 
 def stricter(store: Store, gate: Gate, domain: Domain) -> Store:
@@ -222,28 +219,29 @@ def fitted(
     store.emit(Event("stage-started", "fit", {}))
     problem = replace(problem, route=question.route.name)
     made = question.family.fit(replace(problem, route=question.fit.name))
-    gap, record = question.route.band(made, problem, question.request, store, ledger, question.digest)
+    gap, record = question.route.band(made, problem, question.request, store, ledger, question.identity)
     return gap, problem, record
 
 
 def audit(
     gap: GapFunction, problem: GapProblem, question: Question, store: Store, ledger: Ledger, record: Record | None
 ) -> Audit:
-    """Draw audit k's points from (seed, k), as many as ε and β_k = β / 2^k need; test l ≤ r ≤ u and |r| ≤ γ on them.
+    """Draw audit k's points, which no fit can know, as many as ε and β_k = β / 2^k need; test l ≤ r ≤ u and |r| ≤ γ on them.
 
-    Where the route has made a record, k is its number: that has spent β_k, and the audit can only refute.
+    Where the route has made a record, its entry is that of the audit: it has spent β_k, and the audit can only refute.
     """
     request = question.request
     # The same function about other hidden states, or drawn in other coordinates, is audited at other points or answers.
     object_ = f"{gap_digest(gap, problem)}:{store.key}:{request.epsilon!r}:{request.beta!r}"
-    k = ledger.enter(question.digest, object_) if record is None else record.k
+    entry = ledger.enter(question.identity, "audit", object_) if record is None else record.entry
+    k = entry.k
     n = audit_size(request.epsilon, request.beta / 2**k)
-    z = problem.domain.draw(n, np.random.default_rng([problem.seed, k]))
+    z = problem.domain.draw(n, entry.draws(problem.seed, "audit"))
     store.emit(Event("stage-started", "audit", {"number": k, "points": n}))
     r = store.collect(f"audit-{k}", Points(z))
     outside, above = _judged(gap, z, r, Pulse(store.emit, "audit", n, "points"))
     limit = 0 if record is None else record.allowed(n, request.epsilon)
-    return Audit(z, r, k, request.epsilon, request.beta, outside, above, limit)
+    return Audit(z, r, entry, request.epsilon, request.beta, outside, above, limit)
 
 
 def _violations(gap: GapFunction, z: Array, r: Array) -> tuple[Bools, Bools]:
@@ -265,9 +263,11 @@ def _judged(gap: GapFunction, z: Array, r: Array, pulse: Pulse) -> tuple[Bools, 
     return both[0], both[1]
 
 
-def attack(gap: GapFunction, residual: Residual, domain: Domain, n: int, seed: int, emit: Emit = silent) -> dict[str, int]:
+def attack(
+    gap: GapFunction, residual: Residual, domain: Domain, n: int, rng: np.random.Generator, emit: Emit = silent
+) -> dict[str, int]:
     """Count violations on n further uniform points, drawn block by block; nothing is stored."""
-    rng, counts, block = np.random.default_rng([seed, 0xA77AC]), {"points": 0, "violations": 0, "gamma_violations": 0}, 100_000
+    counts, block = {"points": 0, "violations": 0, "gamma_violations": 0}, 100_000
     while counts["points"] < n:
         z = domain.draw(min(block, n - counts["points"]), rng)
         outside, above = _violations(gap, z, residual(z))
@@ -287,13 +287,15 @@ def conclude(
     audited: Audit,
     gate: Gate,
     store: Store,
+    ledger: Ledger,
 ) -> Certificate:
     """Evidence and the strongest claim, of those asked for, that the evidence allows."""
     route, request, model = question.route, question.request, question.model
     refuted = route.refuted(problem, gap)
-    gate = hidden_state.attacked(gate, gap, problem, model, store.emit)
-    whole, n = Residual(store.residual.backend, model), request.attack
-    attacked = attack(gap, whole, problem.domain, n, problem.seed, store.emit) if n else {}
+    moved = partial(ledger.enter, question.identity, "hidden state", f"{gap_digest(gap, problem)}:{store.key}")
+    gate = hidden_state.attacked(gate, gap, problem, model, moved, store.emit)
+    whole, fresh = Residual(store.residual.backend, model), audited.entry.draws(problem.seed, "attack")
+    attacked = attack(gap, whole, problem.domain, request.attack, fresh, store.emit) if request.attack else {}
     if record is not None and attacked:
         attacked["allowed"] = record.allowed(request.attack, request.epsilon)
     rests = route.sentences(Findings(problem, gap, record, audited, model, gate, refuted))

@@ -9,9 +9,11 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.certification.certificate import Audit, Ledger, Record
+from gapcert.certification.certificate import Audit, Record
 from gapcert.certification.coordinates import in_words
+from gapcert.certification.fingerprint import Fingerprint
 from gapcert.certification.gates.hidden_state import Gate
+from gapcert.certification.ledger import Ledger
 from gapcert.certification.refutation import contradiction, curvature_contradiction, curvature_sentences, jump_sentence
 from gapcert.certification.samples.store import Store
 from gapcert.certification.supremum import supremum
@@ -85,7 +87,7 @@ class Route(ABC):
         return self.name, backend
 
     def band(
-        self, gap: GapFunction, problem: GapProblem, request: Request, store: Store, ledger: Ledger, question: str
+        self, gap: GapFunction, problem: GapProblem, request: Request, store: Store, ledger: Ledger, question: Fingerprint
     ) -> tuple[GapFunction, Record | None]:
         """What is claimed of a fitted function, and the record of how it came about; here the function itself."""
         return gap, None
@@ -233,6 +235,7 @@ def _assumptions(basis: Sequence[str], problem: GapProblem, audited: Audit, mode
         scope(model, problem.domain),
         f"The audit's {len(audited.z)} points are independent and uniform on {problem.domain.words}{gate.distribution} (audit "
         f"{audited.k} of this question); its statement does not carry over to other distributions, nor to a closed loop.",
+        *audited.entry.sentences,
     ]
 
 

@@ -23,6 +23,7 @@ from gapcert.certification.gates.hidden_distribution import (
     moved,
     visited,
 )
+from gapcert.certification.ledger import Entry
 from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.gaps.gap import GapFunction, GapProblem
 from gapcert.contracts.gaps.lipschitz import Residual
@@ -273,18 +274,29 @@ def spread(draws: HiddenDraws, domain: Domain, seed: int) -> Array:
     return np.asarray(np.ptp(d, axis=0).max(axis=0) / 2)
 
 
-def attacked(gate: Gate, gap: GapFunction, problem: GapProblem, model: Model, emit: Emit = silent, n: int = 256) -> Gate:
+def attacked(
+    gate: Gate,
+    gap: GapFunction,
+    problem: GapProblem,
+    model: Model,
+    enter: Callable[[], Entry],
+    emit: Emit = silent,
+    n: int = 256,
+) -> Gate:
     """γ of the default hidden state, asked about others: the share of probes with |r| > γ, and the worst.
 
-    Half of the probes move the hidden state as the gate does, the others are visited in rollouts. Where hidden state does not
-    matter or is drawn, the audit has asked already.
+    `enter` has the book count it: by that entry it is drawn, so that no fit can know what is asked. Half of the probes move the
+    hidden state as the gate does, the others are visited in rollouts. Where hidden state does not matter or is drawn, the
+    audit has asked already.
     """
     if gate.probe is None or gate.probe.harmless or gate.law is not None:
         return gate
-    backend, domain, rng = gate.system, problem.domain, np.random.default_rng([problem.seed, 0xA77AD])
+    backend, domain, entry = gate.system, problem.domain, enter()
+    rng = entry.draws(problem.seed, "hidden state")
     x, u = (np.ascontiguousarray(part) for part in domain.split(domain.draw(n, rng)))
     pulse = Pulse(emit, "attack", THRESHOLDS.hidden_steps + -(-2 * n // _BLOCK), "steps", "from other hidden states")
-    met = visited(backend, domain, max(THRESHOLDS.hidden_runs, n // 8), THRESHOLDS.hidden_steps, problem.seed + 2, pulse)
+    runs, started = max(THRESHOLDS.hidden_runs, n // 8), int(rng.integers(2**32))
+    met = visited(backend, domain, runs, THRESHOLDS.hidden_steps, started, pulse)
     parts = [(x, u, moved(backend, n, rng, gate.plan.ranges)), _met(domain, met, rng, n)]
     x, u, h = (np.concatenate(part) for part in zip(*parts, strict=True))
     gamma, after = gap.gamma(np.hstack([x, u])), []
@@ -295,6 +307,7 @@ def attacked(gate: Gate, gap: GapFunction, problem: GapProblem, model: Model, em
     r = difference(model.states, np.concatenate(after), model.step(x, u).x)
     above = (np.abs(r) > gamma).any(axis=1)
     out: dict[str, Any] = {"points": len(x), "violations": int(above.sum()), "share": float(above.mean())}
+    out |= entry.summary()
     if above.any():
         k, i = np.unravel_index(int(np.argmax(np.abs(r) / np.maximum(gamma, np.finfo(float).tiny))), r.shape)
         witness = {"z": [*x[k].tolist(), *u[k].tolist()], "hidden": h[k].tolist(), "state": gate.states[i]}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 import re
@@ -84,6 +85,21 @@ def known_unit(text: str) -> bool:
         return bool(_registry().Quantity(0.0, unit).to_base_units().magnitude == 0)
     except Exception:  # pint raises whatever its definitions raise
         return False
+
+
+_COHERENT = re.compile(r"(?:\b(?:1|m|s|kg|rad|A|K|N|J|W|V|C|Hz|Pa)\b|\*\*-?\d|\^-?\d|[*/ ()·])*")
+"""Products of symbols that SI units are multiplied of without a factor: these need no pint, whose import takes long."""
+
+
+@functools.lru_cache(4096)
+def base(unit: str) -> tuple[float, float]:
+    """(a, b): a number v in the unit is a v + b in SI base units; (1, 0) of a unit that is not known."""
+    if not _COHERENT.fullmatch(unit):
+        with contextlib.suppress(Exception):  # pint raises whatever its tokenizer raises
+            parsed = _registry().parse_units(unit)
+            zero, far = (float(_registry().Quantity(v, parsed).to_base_units().magnitude) for v in (0.0, 2.0**30))
+            return (far - zero) / 2.0**30, zero
+    return 1.0, 0.0
 
 
 @functools.cache
