@@ -33,7 +33,6 @@ from gapcert.certification.routes import Route as Route
 from gapcert.certification.samples.executors import processes as processes
 from gapcert.certification.samples.store import Store as Store
 from gapcert.certification.supremum import supremum as supremum
-from gapcert.cli.listing import entry as entry
 from gapcert.contracts.controllers.control import Controller as Controller
 from gapcert.contracts.controllers.control import SynthesisProblem as SynthesisProblem
 from gapcert.contracts.controllers.control import Synthesizer as Synthesizer
@@ -101,6 +100,7 @@ from gapcert.contracts.plugins.presentation import View as View
 from gapcert.contracts.plugins.presentation import view as view
 from gapcert.contracts.plugins.registry import Registry as Registry
 from gapcert.contracts.plugins.registry import hookimpl as hookimpl
+from gapcert.contracts.plugins.registry import installed as installed
 from gapcert.contracts.plugins.registry import registry as registry
 from gapcert.contracts.systems.arithmetic import Arithmetic as Arithmetic
 from gapcert.contracts.systems.cells import Cells as Cells
@@ -186,14 +186,22 @@ from gapcert.numerics.texts import columns as columns
 from gapcert.numerics.texts import leaves as leaves
 from gapcert.numerics.texts import times as times
 from gapcert.run.build import Build as Build
+from gapcert.run.folder import LOCK as LOCK
+from gapcert.run.folder import MARK as MARK
+from gapcert.run.folder import is_run as is_run
+from gapcert.run.folder import owned as owned
 from gapcert.run.folder import stored as stored
+from gapcert.run.progress_rate import duration as duration
 from gapcert.run.progress_rate import figure as figure
 from gapcert.run.run import Outcome as Outcome
 from gapcert.run.run import Study as Study
 from gapcert.run.run import cpu_seconds as cpu_seconds
 from gapcert.run.status import RunFolder as RunFolder
+from gapcert.run.status import folders as folders
+from gapcert.run.status import walk as walk
 from gapcert.run.verdict import outside as outside
 from gapcert.run.verdict import share as share
+from gapcert.spec.check import COMPONENTS as COMPONENTS
 from gapcert.spec.compose import regular as regular
 from gapcert.spec.models import near as near
 from gapcert.spec.models import unknown_key as unknown_key
@@ -205,6 +213,7 @@ from gapcert.spec.sections.plugin_sections import Checker as Checker
 from gapcert.spec.sections.plugin_sections import Drawn as Drawn
 from gapcert.spec.sections.plugin_sections import Schema as Schema
 from gapcert.spec.sections.plugin_sections import SpecSection as SpecSection
+from gapcert.spec.sections.sections import SECTIONS as SECTIONS
 from gapcert.spec.sections.sections import Bound as Bound
 from gapcert.spec.sections.sections import Boxes as Boxes
 from gapcert.spec.sections.sections import Config as Config
