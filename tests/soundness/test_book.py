@@ -3,19 +3,11 @@
 from __future__ import annotations
 
 import json
-from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
-import pytest
 from spellings import another, asked, drawn, respelled
 
-import gapcert as gc
 from gapcert.certification.fingerprint import Fingerprint, Known
-from gapcert.certification.ledger import Entry, Ledger
-from gapcert.contracts.gaps.claim import audit_size
-from gapcert.numerics.order_statistics import missed
-from gapcert.testing.toys import Drift, Perturbed, ripple
 
 
 def kept(question: Fingerprint) -> Known:

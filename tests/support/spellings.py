@@ -33,7 +33,9 @@ def drawn(rng: Draws) -> Spec:
     f = {s: sum_of([f"{s}", *(term(rng, axes) for _ in range(rng.integers(1, 3)))]) for s in states}
     fhat = {s: sum_of([text, *(term(rng, axes, 0.05) for _ in range(rng.integers(0, 3)))]) for s, text in f.items()}
     # Half of the ranges are equal, so that their order tells nothing.
-    ranges = {n: [-same[0], same[0]] if rng.random() < 0.5 else sorted(np.round(rng.uniform(-4, 4, 2), 3).tolist()) for n in axes}
+    ranges = {
+        n: [-same[0], same[0]] if rng.random() < 0.5 else sorted(np.round(rng.uniform(-4, 4, 2), 3).tolist()) for n in axes
+    }
     spec = {
         "version": 1,
         "name": "drawn",
@@ -87,7 +89,9 @@ def texts(spec: Spec, change: Callable[[str], str]) -> None:
 
 def renamed(spec: Spec, rng: Draws) -> None:
     names = [*spec["model"]["states"], *spec["model"]["inputs"]]
-    new = dict(zip(names, rng.permutation([f"{w}_{k}" for k, w in enumerate("abcdefghijk"[: len(names)])]).tolist(), strict=True))
+    new = dict(
+        zip(names, rng.permutation([f"{w}_{k}" for k, w in enumerate("abcdefghijk"[: len(names)])]).tolist(), strict=True)
+    )
 
     def changed(text: str) -> str:
         return re.sub("|".join(WORD.format(n) for n in names), lambda m: new[m[0]], text)
@@ -146,11 +150,14 @@ def rewritten(spec: Spec, rng: Draws) -> None:
 
 def with_parameters(spec: Spec, rng: Draws) -> None:
     for part in (spec["model"], spec["backend"]):
-        found = sorted(set(re.findall(r"(?<![\w.*])\d+\.\d+(?=\*)", " ".join(part["next"].values()))))[: int(rng.integers(1, 4))]
+        found = sorted(set(re.findall(r"(?<![\w.*])\d+\.\d+(?=\*)", " ".join(part["next"].values()))))[
+            : int(rng.integers(1, 4))
+        ]
         part.setdefault("parameters", {}).update({f"k{part['period'][0]}{k}_": float(v) for k, v in enumerate(found)})
         for k, v in enumerate(found):
             part["next"] = {
-                s: re.sub(rf"(?<![\w.*]){re.escape(v)}(?=\*)", f"k{part['period'][0]}{k}_", text) for s, text in part["next"].items()
+                s: re.sub(rf"(?<![\w.*]){re.escape(v)}(?=\*)", f"k{part['period'][0]}{k}_", text)
+                for s, text in part["next"].items()
             }
 
 

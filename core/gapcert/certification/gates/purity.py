@@ -90,7 +90,10 @@ def purity(
     for what, index, answer in itertools.chain(contexts(system, rows, seed), [copied], held(system, rows, first)):
         d = max(d, _same(role, system, rows, first, index, answer, what))
         tell(what)
-    said, there = "repeated and permuted queries, close neighbours, other sizes of call", _elsewhere(system, rows, executor, seed)
+    said, there = (
+        "repeated and permuted queries, close neighbours, other sizes of call",
+        _elsewhere(system, rows, executor, seed),
+    )
     if isinstance(there, str):
         return f"{said} and a fresh copy {agreed(d)} ({there})"
     for index, answer in there:
