@@ -199,7 +199,12 @@ def test_a_full_turn_has_no_outside(low: float, tmp_path: Path) -> None:
     edges = np.linspace(low, low + 2 * np.pi, 12)
     bits = np.packbits(np.eye(11, dtype=bool), axis=1)
     c = GridController(
-        Goal("invariance", Box((h,), (low,), (low + 2 * np.pi,))), (edges,), np.arange(11.0)[:, None], bits, np.zeros(11, np.int32), {}
+        Goal("invariance", Box((h,), (low,), (low + 2 * np.pi,))),
+        (edges,),
+        np.arange(11.0)[:, None],
+        bits,
+        np.zeros(11, np.int32),
+        {},
     )
     export(c, "numpy", tmp_path)
     ends = (low + 2 * np.pi * np.arange(-20, 21))[:, None]

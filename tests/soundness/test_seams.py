@@ -139,13 +139,13 @@ def test_without_the_gate_a_deterministic_certificate_breaks(tmp_path, monkeypat
     """A spring that counts turns: certified over a turn, and a run that begins on another one leaves the goal for good."""
     f = gc.load_spec(SPRING).build("model")
     domain = Domain.of(f, {"h": (-np.pi, np.pi), "u": (-1.0, 1.0)})
-    goal = Goal("invariance", domain.states, None, Region((Box(f.states, (2.6, ), (3.6,)),)))
+    goal = Goal("invariance", domain.states, None, Region((Box(f.states, (2.6,), (3.6,)),)))
     options = {"lipschitz": gc.registry().build("lipschitz", "interval"), "sampling": gc.AdaptiveSampling(30)}
     options |= {"request": gc.Request("deterministic", 0.1, 0.1)}
     symbolic = gc.registry().get("synthesizer", "symbolic").load()(cells={"h": 60}, inputs={"u": 9})
-    with pytest.raises(gc.UsageError, match="moves h by 0.93 turns"):
+    with pytest.raises(gc.UsageError, match=r"moves h by 0\.93 turns"):
         gc.certify(f, f, domain, folder=tmp_path / "refused", **options)
-    with pytest.raises(gc.UsageError, match="moves h by 0.93 turns"):
+    with pytest.raises(gc.UsageError, match=r"moves h by 0\.93 turns"):
         symbolic.synthesize(gc.SynthesisProblem(f, None, domain, goal))
     monkeypatch.setattr("gapcert.certification.certify.repeating", lambda *given: ())
     monkeypatch.setattr(type(f), "repeats", lambda self, angle: "")
