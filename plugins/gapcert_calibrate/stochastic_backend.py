@@ -135,7 +135,6 @@ class Stochastic(Backend):
         return self.system.resolution(magnitude)
 
     def repeats(self, angle: str) -> str | None:
-        """At the stated parameters; others are drawn."""
         return None if self.factors or self.ranges else self.system.repeats(angle)
 
     def digest(self) -> str:

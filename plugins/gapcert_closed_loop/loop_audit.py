@@ -20,7 +20,7 @@ STARTS = "starts drawn uniformly where both controllers win, the target left out
 @final
 @dataclass(frozen=True)
 class Oracle:
-    """What a step was promised from: x⁺ ∈ f(x, u) + [l, u](x, u), with angles on the turn of `states`, where the gap is known."""
+    """What a step was promised from: x⁺ ∈ f(x, u) + [l, u](x, u), with angles on the turn of `states`."""
 
     model: Model
     gap: GapFunction

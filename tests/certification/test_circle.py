@@ -51,8 +51,8 @@ def told(model: gc.Model, backend: gc.System, ranges: Any = None) -> tuple[str, 
 
 def test_a_proof_of_both_texts() -> None:
     assert told(text(), text(w="w - 0.19*sin(h) + 0.05*u")) == (
-        "h closes on itself (the domain spans a turn); that f repeats with it was proved from its text, that f̂ does was proved "
-        "from its text.",
+        "h closes on itself (the domain spans a turn); that f repeats with it was proved by its equations, that f̂ does was "
+        "proved by its equations.",
     )
     assert told(text(), text(), PART) == ()
 
@@ -66,7 +66,7 @@ def test_an_engine_is_probed(kind: str) -> None:
 @pytest.mark.parametrize("kind", ["spring", "cable"])
 @pytest.mark.parametrize("said", [None, "", "its cable winds up"])
 def test_an_engine_that_winds_up_is_refused_with_both_numbers(kind: str, said: str | None) -> None:
-    with pytest.raises(gc.UsageError, match=r"but the backend does not repeat with it: .*its state 1 becomes .* turn on") as e:
+    with pytest.raises(gc.UsageError, match=r"but the backend does not repeat with it: .*it steps to w = .* turn on to") as e:
         told(text(), Engine(kind, said))
     assert (said or "") in str(e.value)
     assert told(text(), Engine(kind, said), PART) == (), "on a part of the turn it is a number"
@@ -75,7 +75,7 @@ def test_an_engine_that_winds_up_is_refused_with_both_numbers(kind: str, said: s
 @pytest.mark.parametrize(("h", "w"), [("0.9*h + 0.05*w", "w"), ("h", "w - 0.2*h"), ("h", "w + exp(-((h - 1)/1e-4)**2)")])
 def test_a_text_without_a_proof_is_refused(h: str, w: str) -> None:
     for pair, role in (((text(h, w), text()), "model"), ((text(), text(h, w)), "backend")):
-        with pytest.raises(gc.UsageError, match=rf"h closes on itself, .* but the {role} does not repeat with it"):
+        with pytest.raises(gc.UsageError, match=rf"h closes on itself .*, but the {role} does not repeat with it"):
             told(*pair)
     assert told(text(h, w), text(h, w), PART) == ()
 
@@ -83,7 +83,7 @@ def test_a_text_without_a_proof_is_refused(h: str, w: str) -> None:
 def test_turns_that_only_one_of_both_makes_close_the_circle() -> None:
     """A residual on the circle forgets whole turns; where f̂ makes one, its next step begins there."""
     ahead = text("0.5*h + 0.05*w + 6.283185307179586")
-    with pytest.raises(gc.UsageError, match=r"f and f̂ are whole turns apart, but the model does not repeat"):
+    with pytest.raises(gc.UsageError, match=r"f and f̂ are whole turns apart\), but the model does not repeat"):
         told(text("0.5*h + 0.05*w"), ahead, PART)
     assert "whole turns apart" in told(text(), text("h + 0.05*w + 6.283185307179586"), PART)[0]
     assert told(text(), Engine("sensor"), FULL | {"h": (3.0, 3.4)})[0].startswith("h closes on itself (f and f̂ are whole turns")

@@ -43,19 +43,15 @@ def onto(low: float, high: float, x: Array) -> Array:
     with np.errstate(over="ignore"):
         k = turns(far, (low + high) / 2)
         back = far - TURN * k
-        on = spans(low, high) | (begun(low, k, far) & ended(high, k, far))
+        on = spans(low, high) | between(low, high, k, far, far)
     y[out] = np.where(on, np.clip(back, low, high), back)
     return y
 
 
-def begun(low: float, k: Any, x: Array) -> Bools:
-    """Is x at the lower end of copy k of an arc, or above it?"""
-    return np.asarray((x >= low + TURN * k) | (x - TURN * k >= low))
-
-
-def ended(high: float, k: Any, x: Array) -> Bools:
-    """Is x at the upper end of copy k of an arc, or below it?"""
-    return np.asarray((x <= high + TURN * k) | (x - TURN * k <= high))
+def between(low: float, high: float, k: Any, x: Array, y: Array) -> Bools:
+    """Is x at the lower end of copy k of the arc or above it, and y at the upper end or below it?"""
+    move = TURN * k
+    return np.asarray(((x >= low + move) | (x - move >= low)) & ((y <= high + move) | (y - move <= high)))
 
 
 def copies(low: float, high: float, first: float, last: float) -> range:

@@ -69,5 +69,4 @@ def _shapes(goal: Goal) -> dict[str, Table]:
 
 def ends_of(box: Box) -> list[list[float]]:
     """[low, high, middle, 1 where that is a full turn] per axis."""
-    ends = zip(box.low, box.high, strict=True)
-    return [[low, high, (low + high) / 2, float(circle.spans(low, high))] for low, high in ends]
+    return [[a, b, (a + b) / 2, float(circle.spans(a, b))] for a, b in zip(box.low, box.high, strict=True)]

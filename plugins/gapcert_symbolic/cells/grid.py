@@ -163,7 +163,7 @@ class Grid:
         for turns in circle.copies(low, high, self.box.low[k], self.box.high[k]) if angle else range(1):
             # As states on the turn of the grid are held against the box: what holds of both ends of a cell holds within it.
             first, last = (upper + self._rounded[k], lower - self._rounded[k]) if outer else (lower, upper)
-            found |= circle.begun(low, turns, first) & circle.ended(high, turns, last)
+            found |= circle.between(low, high, turns, first, last)
         return found
 
     def _product(self, masks: list[Bools], cell: Ints | None) -> Bools:

@@ -17,35 +17,27 @@ def repeating(model: Model, backend: System, domain: Domain, seed: int) -> tuple
 
     UsageError where f or f̂ does not repeat with it.
     """
-    angles = [j for j, axis in enumerate(domain.states.axes) if axis.kind == "angle"]
-    if not angles:
-        return ()
     z = domain.draw(THRESHOLDS.purity_rows, np.random.default_rng([seed, 0xC19C]))
     x, u = (np.ascontiguousarray(part) for part in domain.split(z))
-    apart = np.abs(backend.step(x, u).x - model.step(x, u).x).max(axis=0)
-    said = []
-    for j in angles:
-        if domain.states.wraps[j] or apart[j] > TURN / 2:
+    said, apart = [], np.abs(backend.step(x, u).x - model.step(x, u).x).max(axis=0)
+    for j, axis in enumerate(domain.states.axes):
+        if axis.kind == "angle" and (domain.states.wraps[j] or apart[j] > TURN / 2):
             why = "the domain spans a turn" if domain.states.wraps[j] else "f and f̂ are whole turns apart"
-            proofs = [_proof(*pair, j, why, x, u) for pair in (("model", model), ("backend", backend))]
-            said.append(
-                f"{domain.axes[j].name} closes on itself ({why}); that f repeats with it was {proofs[0]}, that f̂ does was "
-                f"{proofs[1]}."
-            )
+            what, of = f"{axis.name} closes on itself ({why})", ((model, "model"), (backend, "backend"))
+            f, fhat = (_proof(what, *each, j, x, u) for each in of)
+            said.append(f"{what}; that f repeats with it was {f}, that f̂ does was {fhat}.")
     return tuple(said)
 
 
-def _proof(role: str, system: System, j: int, closes: str, x: Array, u: Array) -> str:
+def _proof(what: str, system: System, role: str, j: int, x: Array, u: Array) -> str:
     """How it is known that a system repeats along state j; UsageError where it does not, or where its text is no proof."""
-    name, known = system.states[j].name, system.repeats(system.states[j].name)
-    seen = _witness(system, j, x, u)
+    known, seen = system.repeats(system.states[j].name), _witness(system, j, x, u)
     if known or seen:
         raise UsageError(
-            f"certify: {name} closes on itself, since {closes}, but the {role} does not repeat with it: "
-            f"{'; '.join(filter(None, (known, seen)))}; expected the same step a turn further, but for whole turns of angles; "
-            f"write it so (in sin and cos), narrow the domain to a part of the turn, or declare {name} as a real number"
+            f"certify: {what}, but the {role} does not repeat with it: {'; '.join(filter(None, (known, seen)))}; expected the "
+            f"same step a turn further, but for whole turns of angles; write it so (in sin and cos), or narrow the domain"
         )
-    return f"probed at {len(x)} states, not proved" if known is None else "proved from its text"
+    return f"probed at {len(x)} states, not proved" if known is None else "proved by its equations"
 
 
 def _witness(system: System, j: int, x: Array, u: Array) -> str:
@@ -56,10 +48,9 @@ def _witness(system: System, j: int, x: Array, u: Array) -> str:
     for k in (1, -1):
         there = system.step(x + k * TURN * move, u).x
         e = system.resolution(np.maximum(np.abs(here), np.abs(there)).max(axis=0))
-        excess = np.abs(difference(system.states, there, here)) - THRESHOLDS.repeat_error * (e + rounding)
-        if not (excess <= 0).all():
-            i, c = np.unravel_index(
-                int(np.argmax(np.where(excess <= 0, -np.inf, np.nan_to_num(excess, nan=np.inf)))), excess.shape
-            )
-            return f"from (x, u) = {[*x[i].tolist(), *u[i].tolist()]} its state {c} becomes {here[i, c]:.6g}, {k:+d} turn on {there[i, c]:.6g}"
+        # Asked so that NaN is a change.
+        changed = ~(np.abs(difference(system.states, there, here)) <= THRESHOLDS.repeat_error * (e + rounding))
+        for i, c in np.argwhere(changed)[:1]:
+            at, name = [*x[i].tolist(), *u[i].tolist()], system.states[c].name
+            return f"from (x, u) = {at} it steps to {name} = {here[i, c]:.9g}, {k:+d} turn on to {there[i, c]:.9g}"
     return ""

@@ -151,12 +151,8 @@ class Gate:
         """What the claim owes to the gates, for the list of assumptions."""
         made = [f"Hidden state that the domain names ({', '.join(self.names)}) is state here, and f holds it constant."]
         found = made if self.plan.mode == "augment" and self.names else []
-        return [
-            *self.turns,
-            *found,
-            *([] if self.probe is None else [self._hidden(self.probe)]),
-            *(f"Warning: {w}." for w in self.warnings),
-        ]
+        hidden = [] if self.probe is None else [self._hidden(self.probe)]
+        return [*self.turns, *found, *hidden, *(f"Warning: {w}." for w in self.warnings)]
 
     def _hidden(self, p: Probe) -> str:
         listed = ", ".join(p.names)

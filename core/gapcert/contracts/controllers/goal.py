@@ -121,15 +121,13 @@ class Goal:
         _inside("stay", self.stay, "the domain", domain.states)
         for axis, wraps in zip(self.stay.axes, self.stay.wraps, strict=True):
             if wraps and (why := model.repeats(axis.name)):
-                raise UsageError(
-                    f"goal: stay closes on itself along {axis.name}, and the model does not repeat there: {why}; expected a "
-                    f"model that does, or a goal over part of the turn"
-                )
+                what = f"goal: stay closes on itself along {axis.name}, and the model does not repeat there: {why}"
+                raise UsageError(f"{what}; expected a model that does, or a goal over part of the turn")
 
     def holds(self, x: Array) -> Bools:
         """(n,) booleans: in `stay` and not in `avoid`, for states (n, nx), on the turn of `stay` as cells are."""
         x = turned(self.stay, x)
-        inside = np.asarray(self.stay.contains(x))
+        inside = self.stay.contains(x)
         return inside if self.avoid is None else inside & ~self.avoid.contains(x)
 
     def reached(self, x: Array) -> Bools:
@@ -174,10 +172,9 @@ class Goal:
 
 
 def _inside(name: str, inner: Box, frame: str, outer: Box) -> None:
-    """UsageError unless the one lies in the other; along an axis of `outer` that closes on itself a target may be anywhere."""
-    ends = zip(inner.axes, inner.low, inner.high, outer.low, outer.high, outer.wraps, strict=True)
-    for axis, a, b, low, high, wraps in ends:
-        if (a < low or b > high) and not (wraps and name == "target"):
+    for j, (axis, a, b, low, high) in enumerate(zip(inner.axes, inner.low, inner.high, outer.low, outer.high, strict=True)):
+        # Along an axis that closes on itself a target may be anywhere.
+        if (a < low or b > high) and not (name == "target" and outer.wraps[j]):
             raise UsageError(
                 f"goal: {name} asks for {axis.name} in [{a:g}, {b:g}] {axis.unit}, but {frame} is [{low:g}, {high:g}]; "
                 f"narrow the goal or widen {frame}"

@@ -232,12 +232,9 @@ def _moved(box: Box, low: Array, high: Array, asked: Callable[[Array, Array], Bo
 
 def _turns(box: Box, low: Array, high: Array) -> Iterator[tuple[Array, Array]]:
     """The cells moved by every number of turns of every angle that may bring them to the box, widened by what that rounds."""
-    ranges = [
-        circle.copies(low[:, j].min(), high[:, j].max(), box.low[j], box.high[j])
-        if axis.kind == "angle" and len(low)
-        else range(1)
-        for j, axis in enumerate(box.axes)
-    ]
+    a, b, some = low.min(axis=0, initial=np.inf), high.max(axis=0, initial=-np.inf), len(low) > 0
+    ends = zip(box.axes, a, b, box.low, box.high, strict=True)
+    ranges = [circle.copies(*each) if axis.kind == "angle" and some else range(1) for axis, *each in ends]
     for turns in itertools.product(*ranges):
         t = np.asarray(turns, dtype=np.float64)
         pad = 4 * np.spacing(np.maximum(np.maximum(np.abs(low), np.abs(high)), circle.TURN)) * np.abs(t)

@@ -132,9 +132,8 @@ class System(ABC):
         return self.resolution(magnitude)
 
     def repeats(self, angle: str) -> str | None:
-        """Is f(x + 2π, u) = f(x, u) along the state of this name, up to whole turns of angles, in what is remembered too?
-
-        Empty where that is proved or declared, else why it is not; None: not known, and it is probed where it matters.
+        """Why f(x + 2π, u) = f(x, u) along this state, up to whole turns of angles, is not true (of what is remembered too);
+        empty where it is proved to be, and None where nothing is known: it is probed then.
         """
         return None
 
