@@ -13,7 +13,17 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array, Interval, Model, Recording, Trajectory, UsageError
-from gapcert.plugin import TURN, Coordinates, RelativeModel, Zone, damage_told, difference, magnitude, stated_units, without_units
+from gapcert.plugin import (
+    TURN,
+    Coordinates,
+    RelativeModel,
+    Zone,
+    damage_told,
+    difference,
+    magnitude,
+    stated_units,
+    without_units,
+)
 from gapcert_monitor.thresholds import THRESHOLDS
 from gapcert_recordings import Transitions, axes
 from gapcert_verify import Evidence, bounds, load, zone
