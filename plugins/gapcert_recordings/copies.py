@@ -1,21 +1,21 @@
 """The same measurement twice: trajectories, or stretches of them, that hold the values of another, noise included.
 
-Found by content, whatever their names, clocks, lengths, formats and digits are. A repetition of one command is no copy, since what
-is measured has noise of its own; nor are two logs that stand still at the same values.
+Found by content, whatever their names, clocks, lengths, formats and digits are. A repetition of one command is no copy, since
+what is measured has noise of its own; nor are two logs that stand still at the same values.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import final
 
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.plugin import Array, Bools, Recording, Trajectory
+from gapcert.plugin import SHORTEST, Array, Bools, Recording, Trajectory
 from gapcert_recordings.thresholds import THRESHOLDS
 
 Rows = npt.NDArray[np.intp]
@@ -47,16 +47,19 @@ class Copies:
     rows: tuple[Bools, ...]
 
     @classmethod
-    def of(cls, recording: Recording, inputs: Collection[str] = (), first: Collection[int] = ()) -> Copies:
+    def of(
+        cls, recording: Recording, inputs: Collection[str] = (), first: Collection[int] = (), within: bool = False
+    ) -> Copies:
         """Longer trajectories count before shorter ones, and then those that were read before; those in `first` before all.
 
-        inputs: channels that are commanded, which may be the same to the last bit in two different measurements.
+        inputs: channels that are commanded, which may be the same to the last bit in two different measurements. within: are
+        rows compared with those of their own trajectory, too?
         """
         series = [_Series.of(tr, inputs) for tr in recording.trajectories]
         order = sorted(range(len(series)), key=lambda i: (i not in first, -len(series[i].t), series[i].coarse, i))
         rows, found = tuple(np.zeros(len(s.t), dtype=bool) for s in series), dict[tuple[int, int], Rows]()
         # Few neighbours are looked up of a row: more copies of it are found once these are left out.
-        while new := _found(series, [i for i in order if not rows[i].all()], rows):
+        while new := _found(series, [i for i in order if not rows[i].all()], rows, within):
             found |= new
         titles = _titles(recording.trajectories)
         told = []
@@ -64,6 +67,25 @@ class Copies:
             tr = recording.trajectories[b]
             told.append(Copy(titles[b], titles[a], float(tr.t[k[0]]), len(k), len(k) == len(tr)))
         return cls(tuple(told), rows)
+
+    def kept(self, tr: Trajectory, number: int) -> Trajectory | None:
+        """What counts of the trajectory of that number, without values in rows that are copies; None where too few are left."""
+        rows = self.rows[number]
+        left = {n: np.where(rows, np.nan, v) for n, v in tr.channels.items()}
+        enough = all(np.isfinite(v).sum() >= SHORTEST for v in left.values())
+        return tr if not rows.any() else replace(tr, channels=left) if enough else None
+
+    def without(self, recording: Recording) -> Recording:
+        """What counts of all trajectories."""
+        kept = (self.kept(tr, i) for i, tr in enumerate(recording.trajectories))
+        return replace(recording, trajectories=tuple(tr for tr in kept if tr is not None)) if self.found else recording
+
+    @property
+    def told(self) -> tuple[str, ...]:
+        """A sentence for each, and one for those beyond the `copies_told` first."""
+        most = THRESHOLDS.copies_told
+        more = (f"and {len(self.found) - most} more",) if len(self.found) > most else ()
+        return tuple(map(str, self.found[:most])) + more
 
 
 def _titles(trajectories: Sequence[Trajectory]) -> list[str]:
@@ -148,10 +170,12 @@ def _quantum(v: Array, form: tuple[int, int, bool]) -> Array:
     return np.maximum(out, 10.0 ** (np.floor(np.log10(size)) - digits + 1)) if digits < 17 else out
 
 
-def _found(series: Sequence[_Series], order: Sequence[int], rows: Sequence[Bools]) -> dict[tuple[int, int], Rows]:
-    """(a, b): rows of b that are in a, an earlier one of the order; they are marked. Rows that are marked stand for no others."""
+def _found(series: Sequence[_Series], order: Sequence[int], rows: Sequence[Bools], within: bool) -> dict[tuple[int, int], Rows]:
+    """(a, b): rows of b that are in a, an earlier one of the order; they are marked."""
     kept, found = [series[i] for i in order], dict[tuple[int, int], Rows]()
-    for (j, k), places in sorted(_meetings(kept).items(), key=lambda item: item[0][::-1]):
+    if len(kept) == 1 and not within:
+        return found
+    for (j, k), places in sorted(_meetings(kept, within).items(), key=lambda item: item[0][::-1]):
         a, b = order[j], order[k]
         own = np.any([_shared(kept[j], kept[k], at, rows[a]) for at in places], axis=0) & ~rows[b]
         if own.any():
@@ -160,7 +184,7 @@ def _found(series: Sequence[_Series], order: Sequence[int], rows: Sequence[Bools
     return found
 
 
-def _meetings(series: Sequence[_Series]) -> dict[tuple[int, int], list[Array]]:
+def _meetings(series: Sequence[_Series], within: bool) -> dict[tuple[int, int], list[Array]]:
     """Of trajectories (a, b), a before b, that may share rows: where in a, in rows, those of b (T,) would be.
 
     Where several rows lie alike, and as far apart in both, they are worth a look. Trajectories may be sampled at other rates.
@@ -175,7 +199,7 @@ def _meetings(series: Sequence[_Series]) -> dict[tuple[int, int], list[Array]]:
         every = {i: round(r) for i, r in enumerate(ratio) if r > 0.98 and abs(r - round(r)) < 0.02 * r}
         if slowest and max(every.values()) == 1:
             continue
-        for a, b, shift in _alike(points, every):
+        for a, b, shift in _alike(points, every, within):
             rows = np.arange(len(series[b].t))
             if every[b] == 1:
                 found.setdefault((a, b), []).append(every[a] * rows + float(shift))
@@ -207,7 +231,7 @@ def _scaled(series: Sequence[_Series]) -> list[Array]:
     return [np.nan_to_num(s.values[:, best]) / open_[best] for s in series]
 
 
-def _alike(points: Sequence[Array], every: Mapping[int, int]) -> Iterator[tuple[int, int, int]]:
+def _alike(points: Sequence[Array], every: Mapping[int, int], within: bool) -> Iterator[tuple[int, int, int]]:
     """(a, b, shift): of what a and b have every so many rows, rows i of a and j of b, i = every_a·j + shift, or the reverse."""
     from scipy.spatial import cKDTree
 
@@ -234,7 +258,7 @@ def _alike(points: Sequence[Array], every: Mapping[int, int]) -> Iterator[tuple[
     i, j = np.where(swap, j, i), np.where(swap, i, j)
     a, b = number[i], number[j]
     shift = np.where(steps[b] == 1, row[i] - steps[a] * row[j], row[j] - steps[b] * row[i])
-    apart = (a != b) | (np.abs(row[i] - row[j]) >= THRESHOLDS.copy_apart)
+    apart = (a != b) | (within & (np.abs(row[i] - row[j]) >= THRESHOLDS.copy_apart))
     met, votes = np.unique(np.stack([a, b, shift], axis=1)[apart], axis=0, return_counts=True)
     yield from (tuple(m) for m in met[votes >= THRESHOLDS.copy_votes].tolist())
 

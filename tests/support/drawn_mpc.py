@@ -1,6 +1,6 @@
 """Drawn specs of MPC in every mode, with gaps from nothing to more than the goal: each ends in a verdict or in one sentence.
 
-    python tests/support/drawn_mpc.py FIRST LAST    # seeds; prints what ended otherwise, and how the others ended
+python tests/support/drawn_mpc.py FIRST LAST    # seeds; prints what ended otherwise, and how the others ended
 """
 
 import sys
@@ -84,17 +84,22 @@ def _controller(
             goal["avoid"] = [_box(stay, rng, 0.4)]
         return own | {"goal": {"reach_avoid": goal}}
     ends = [0.999 * end for end in stay[state]]
-    return own | {
-        "once": {},
-        "tight": {"tolerance": float(rng.choice([1e-8, 1e-2])), "reference": {state: ends[int(rng.integers(2))]}},
-        "rates": {"rates": {inputs[0]: strength[inputs[0]] * float(10 ** rng.uniform(-2, 0.5))}},
-        "soft": {"soft": {state: {"range": [0.2 * e for e in ends], "linear": float(10 ** rng.uniform(-3, 6))}}},
-        "moving": {"reference": {state: {"at": [[0, ends[0]], ["0.5 s", ends[1]]]}}},
-        "successive": {"linearisation": "successive"},
-        "adaptive": {"adapt": {"k": f"{float(rng.uniform(1, 60)):.3g} %"}, "levels": 2},
-        "terminal": {"terminal": {"kind": "symbolic", "cells": dict.fromkeys(stay, 12), "inputs": dict.fromkeys(inputs, 5)}},
-        "disturbance": {"feedback": "disturbance"},
-    }[mode]
+    return (
+        own
+        | {
+            "once": {},
+            "tight": {"tolerance": float(rng.choice([1e-8, 1e-2])), "reference": {state: ends[int(rng.integers(2))]}},
+            "rates": {"rates": {inputs[0]: strength[inputs[0]] * float(10 ** rng.uniform(-2, 0.5))}},
+            "soft": {"soft": {state: {"range": [0.2 * e for e in ends], "linear": float(10 ** rng.uniform(-3, 6))}}},
+            "moving": {"reference": {state: {"at": [[0, ends[0]], ["0.5 s", ends[1]]]}}},
+            "successive": {"linearisation": "successive"},
+            "adaptive": {"adapt": {"k": f"{float(rng.uniform(1, 60)):.3g} %"}, "levels": 2},
+            "terminal": {
+                "terminal": {"kind": "symbolic", "cells": dict.fromkeys(stay, 12), "inputs": dict.fromkeys(inputs, 5)}
+            },
+            "disturbance": {"feedback": "disturbance"},
+        }[mode]
+    )
 
 
 def ended(seed: int, steps: int = 3) -> str:

@@ -1,6 +1,6 @@
 """Drawn recordings with copies in them: cut, shifted, renamed, rounded, written in another format, thinned; and repetitions.
 
-    python tests/support/recorded_twice.py FIRST LAST    # seeds; prints copies that were missed, and what was taken for one
+python tests/support/recorded_twice.py FIRST LAST    # seeds; prints copies that were missed, and what was taken for one
 """
 
 import sys
