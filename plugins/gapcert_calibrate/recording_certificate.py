@@ -41,7 +41,7 @@ from gapcert.plugin import (
     registry,
 )
 from gapcert_monitor import Certified
-from gapcert_recordings import Transitions
+from gapcert_recordings import Copies, Transitions
 
 from .route import CalibratedGap, NoConstants, constant, ends, scale_of
 
@@ -67,6 +67,7 @@ class Windows:
     rows: int
     skipped: int
     outside: int
+    copies: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         """How many windows there are."""
@@ -80,7 +81,7 @@ class Windows:
     def of(self, windows: Ints) -> Windows:
         rows = np.isin(self.window, windows)
         own = self.t[rows], self.z[rows], self.r[rows], self.window[rows]
-        return Windows(*own, self.rows, self.skipped, self.outside)
+        return Windows(*own, self.rows, self.skipped, self.outside, self.copies)
 
     @classmethod
     def cut(cls, model: Model, recording: Recording, domain: Domain, length: float | None) -> Windows:
@@ -91,14 +92,25 @@ class Windows:
         steps = Transitions.of(model, recording, CALLER)
         if length is not None and not length >= model.period:
             raise UsageError(f"{CALLER}: window = {length} s; expected at least the period of {model.period:g} s")
-        number, keep = np.zeros(len(steps), dtype=np.int64), np.ones(len(steps), dtype=bool)
+        first, last = np.array([(np.nanmin(tr.t), np.nanmax(tr.t)) for tr in recording.trajectories]).T
+
+        def numbered(t: Array, of: Ints) -> Ints:
+            # One number per trajectory and window.
+            inside = 0 * t if length is None else np.floor((t - first[of]) / length + 1e-9)
+            return of * (1 << 40) + inside.astype(np.int64)
+
+        number, keep = numbered(steps.t, steps.trajectory), np.ones(len(steps), dtype=bool)
         if length is not None:
-            ends = [(float(np.nanmin(tr.t)), float(np.nanmax(tr.t))) for tr in recording.trajectories]
-            first, last = (np.array(side)[steps.trajectory] for side in zip(*ends, strict=True))
             slack = 1e-9 * length
-            number = np.floor((steps.t - first + slack) / length).astype(np.int64)
-            begin = first + number * length
-            keep = (steps.t + model.period <= begin + length + slack) & (begin + length <= last + slack)
+            begin = first[steps.trajectory] + (number % (1 << 40)) * length
+            keep = steps.t + model.period <= begin + length + slack
+            keep &= begin + length <= last[steps.trajectory] + slack
+        copies = Copies.of(recording, [s.name for s in model.inputs], within=length is not None)
+        twice = [
+            numbered(tr.t[k], np.full(k.sum(), i))
+            for i, (tr, k) in enumerate(zip(recording.trajectories, copies.rows, strict=True))
+        ]
+        keep &= ~np.isin(number, np.concatenate(twice))
         known = Certified(model, domain.zone, lambda z: (z, z))
         z = known.points(steps.x, steps.u)
         whole = int(keep.sum())
@@ -107,11 +119,11 @@ class Windows:
             short = f"no trajectory is as long as a window of {length} s; take shorter ones"
             away = "no transition of a whole window begins in the domain; take a larger one"
             raise UsageError(f"{CALLER}: {away if whole else short}")
-        _, which = np.unique(np.stack([steps.trajectory, number], axis=1)[keep], axis=0, return_inverse=True)
+        _, which = np.unique(number[keep], return_inverse=True)
         r = known.residual(steps.x[keep], steps.u[keep], steps.x_next[keep])
         left = int((~keep).sum())
         index = np.asarray(which, dtype=np.intp).reshape(-1)
-        return cls(steps.t[keep], z[keep], r, index, len(steps) + steps.skipped, steps.skipped, left)
+        return cls(steps.t[keep], z[keep], r, index, len(steps) + steps.skipped, steps.skipped, left, copies.told)
 
 
 @final
@@ -139,6 +151,7 @@ class CalibratedRecording(SavedStatement):
     states: Mapping[str, StateEvidence]
     entry: Entry | None = None
     versions: Mapping[str, str] = field(default_factory=dict)
+    window: float | None = None
 
     @property
     def certified(self) -> Certified:
@@ -167,7 +180,7 @@ class CalibratedRecording(SavedStatement):
     @property
     def warnings(self) -> list[str]:
         """What a reader of the claim should know first."""
-        rows, said = self.held.unused, []
+        rows, said = self.held.unused, [f"counted once: {copy}" for copy in self.held.copies]
         if 2 * rows["no_transition"] > rows["all"]:
             said.append(
                 f"{rows['no_transition']:,} of {rows['all']:,} rows begin no transition of one period of "
@@ -251,7 +264,7 @@ def calibrate_recording(
     beta = None if confidence is None else beta_of(confidence)
     found = Windows.cut(model, recording, domain, window)
     units = len(found)
-    fitted = _dealt(units, fit, violation, beta, window)
+    fitted = _dealt(found, fit, violation, beta, window)
     order = order_statistics.split(units, seed)
     own, held = found.of(order[:fitted]), found.of(order[fitted:])
     problem = _problem(model, domain, own, family, lipschitz, predictor, seed)
@@ -270,7 +283,7 @@ def calibrate_recording(
     states = figures(band, problem, model, held.z, held.r, constant(band, problem, held.z, rank, scored))
     versions = {"gapcert": __version__, "numpy": np.__version__, "python": platform.python_version()}
     return CalibratedRecording(
-        band, problem, model, claim, said, units, own, held, scale, rank, score, each, states, versions=versions
+        band, problem, model, claim, said, units, own, held, scale, rank, score, each, states, versions=versions, window=window
     )
 
 
@@ -286,8 +299,9 @@ def content(made: CalibratedRecording) -> tuple[int, ...]:
     return tuple(sorted({int(hashlib.sha256(row.tobytes()).hexdigest()[:16], 16) for row in rows})[:_SKETCH])
 
 
-def _dealt(units: int, fit: float, violation: float, beta: float | None, window: float | None) -> int:
+def _dealt(found: Windows, fit: float, violation: float, beta: float | None, window: float | None) -> int:
     """How many windows go to the fit; UsageError where too few are left for the claim."""
+    units = len(found)
     fitted, need = max(1, int(units * fit)), order_statistics.units_needed(violation, beta)
     if units - fitted >= need:
         return fitted
@@ -298,6 +312,7 @@ def _dealt(units: int, fit: float, violation: float, beta: float | None, window:
         f"{CALLER}: {units} {what} have transitions in the domain, {fitted} of them for the fit; {asked} needs {need} others, "
         f"{total} in all, and {left} allow {order_statistics.smallest(left, beta):g} at best; record more, take shorter "
         f"windows if these are {'exchangeable' if beta is None else 'independent'} too, or ask for a larger violation"
+        + (f" (what is in the recording twice counts once: {'; '.join(found.copies)})" if found.copies else "")
     )
 
 
@@ -350,6 +365,7 @@ def _sentences(
         else f"unless this calibration is one of a share β = {beta:g} that are worse."
     )
     rows = found.unused
+    once = f"What is in the recording twice counts once: {'; '.join(found.copies)}. Windows with such rows are left out."
     return (
         f"The unit is {unit}: {len(found)} have transitions in the domain, and these units, with the one that the claim is "
         f"about, are {like}. That is assumed, not tested; a machine that wears, warms up or decays breaks it.",
@@ -360,4 +376,5 @@ def _sentences(
         f"a transition begins in Z: {in_words(model, domain)}. Of {rows['all']:,} rows {rows['no_transition']:,} begin no such "
         f"transition and {rows['outside']:,} one outside Z or in no whole window; nothing is said of them.",
         "It does not carry over to other inputs, machines or days, nor to a closed loop that chooses its own points.",
+        *((once,) if found.copies else ()),
     )

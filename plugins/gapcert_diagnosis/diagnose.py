@@ -14,7 +14,7 @@ import numpy as np
 
 from gapcert.plugin import BEAT, Effect, Emit, Event, Model, Recording, UsageError, registry, silent
 from gapcert_diagnosis.thresholds import THRESHOLDS
-from gapcert_recordings import JITTER, repairs
+from gapcert_recordings import JITTER, Copies, repairs
 
 from .data.consistency import agreeing, doubt, kept_within, ordered
 from .data.dataset import Dataset, Windows
@@ -56,11 +56,40 @@ def diagnose(
     """
     clock = Clock(emit)
     _timed(model, recording, horizons)
-    parts, more = recording.split(hold_out or {"last": 0.25}, train), experiment or {}
+    parts, copies = _once(recording, hold_out or {"last": 0.25}, train, [s.name for s in model.inputs])
+    more = experiment or {}
+    if copies:
+        clock.emit(Event("warning", "recording", {"message": copies}))
     problem = DiagnosisProblem(model, recording, *parts, _effects(effects), horizons, window, more, seed, folder, clock)
     others = (c.load()() for c in registry().of("diagnoser") if c.missing() is None)
     answer = next((d.diagnose for d in others if d.accepts(model)), _searched)
-    return replace(answer(problem), timings=clock.laps)
+    found = answer(problem)
+    return replace(found, timings=clock.laps, assumptions=(*found.assumptions, *((copies,) if copies else ())))
+
+
+def _once(
+    recording: Recording, hold_out: Mapping[str, Any], train: Mapping[str, Any] | None, inputs: Sequence[str]
+) -> tuple[tuple[Recording, Recording], str]:
+    """(what is fitted, what is held out), where what was measured once counts once; and what is in the recording twice.
+
+    Where whole trajectories are held out, it is those that count, and their copies are not fitted.
+    """
+    whole = train is not None or not set(hold_out) & {"last", "from", "to"}
+    copies = None if whole else Copies.of(recording, inputs)
+    fitted, held = (recording if copies is None else copies.without(recording)).split(hold_out, train)
+    if copies is None:
+        first, own = len(held.trajectories), (*held.trajectories, *fitted.trajectories)
+        copies = Copies.of(replace(recording, trajectories=own), inputs, range(first))
+        kept = [copies.kept(tr, i) for i, tr in enumerate(own)]
+        left = [[tr for tr in part if tr is not None] for part in (kept[first:], kept[:first])]
+        if not left[0]:
+            raise UsageError(
+                f"hold_out: what is left for the fit is a copy of what is held out ({'; '.join(copies.told)}); expected other "
+                "measurements; hold out other trajectories",
+                ("diagnose", "hold_out"),
+            )
+        fitted, held = (replace(p, trajectories=tuple(trs)) for p, trs in zip((fitted, held), left, strict=True))
+    return (fitted, held), f"what is in the recording twice counts once: {'; '.join(copies.told)}" if copies.found else ""
 
 
 @final

@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import Array, Interval, Model, Recording, Trajectory, UsageError
-from gapcert.plugin import Band, Box, Coordinates, Domain, RelativeModel, Statement, Zone, circle, damage_told, difference, magnitude, stated_units, without_units
+from gapcert import Array, Claim, Interval, Model, Recording, Trajectory, UsageError
+from gapcert.plugin import Band, Box, Coordinates, Domain, Ints, RelativeModel, Statement, Zone, circle, damage_told, difference, magnitude, order_statistics, stated_units, without_units
 from gapcert_monitor.thresholds import THRESHOLDS
-from gapcert_recordings import Transitions, axes
+from gapcert_recordings import Copies, Transitions, axes
 from gapcert_verify import Evidence, bounds, load, zone
+
+from .drift import drift as _drift
 
 if TYPE_CHECKING:
     from gapcert.plugin import Predictor
@@ -26,15 +28,18 @@ if TYPE_CHECKING:
 @final
 @dataclass(frozen=True)
 class Certified(Statement):
-    """What a certificate is about: the model f, the set Z, and (l, u) at points of it.
+    """What a certificate is about: the model f, the set Z, (l, u) at points of it, and what is claimed of them.
 
-    `relative`: where Z and the band are in coordinates (x, w) and the model in (x, u), how w is made.
+    `relative`: where Z and the band are in coordinates (x, w) and the model in (x, u), how w is made. window: in s, where the
+    claim is about windows of recordings; None there: about whole trajectories.
     """
 
     model: Model
     zone: Zone
     band: Band
     relative: Coordinates | None = None
+    claim: Claim | None = None
+    window: float | None = None
 
     @cached_property
     def domain(self) -> Domain:
@@ -59,7 +64,7 @@ class Certified(Statement):
         relative = model.relative if isinstance(model, RelativeModel) else None
         f = model.inner if isinstance(model, RelativeModel) else model
         assert isinstance(f, Model), "the nominal side of a certificate is a model"
-        return cls(f, certificate.domain.zone, certificate.gap.interval, relative)
+        return cls(f, certificate.domain.zone, certificate.gap.interval, relative, certificate.claim, getattr(certificate, "window", None))
 
     @classmethod
     def load(cls, folder: Path | str, allow_code: bool = False) -> Certified:
@@ -96,7 +101,9 @@ class Certified(Statement):
                 (extended, model) if relative is None else (RelativeModel(extended, relative), RelativeModel(model, relative))
             )
             p = ModelPredictor(*pair)
-        return cls(model, zone(evidence.data), _stored_band(evidence, p), relative)
+        claim, window = Claim(**evidence.data["claim"]), (data.get("certificate") or {}).get("window")
+        length = None if window is None else magnitude(window, "s")
+        return cls(model, zone(evidence.data), _stored_band(evidence, p), relative, claim, length)
 
     def points(self, x: Array, u: Array) -> Array:
         """z (n, nz) in the coordinates of Z; angles on the turn of Z."""
@@ -142,8 +149,10 @@ class Check:
 
     violations: [{"t", "state", "size", "gamma", "trajectory"}], |r_i| > γ_i by more than the stated noise allows, the
     `listed` largest excesses in the order of time; `violated` counts the transitions. rate = violated / points; rate_limit:
-    its upper limit at 95 % (Clopper–Pearson), if transitions were independent. drift: per state, the change of r at a given z
-    from the beginning to the end of the log {"change", "error", "trend"}, None with too few points. `hint`: what to do next.
+    its upper limit at 95 % (Clopper–Pearson), if transitions were independent. The verdict is `violated` where the claim is
+    refuted: more of its `units` (transitions, or windows) have a violation than are `allowed`, see `tolerated`. drift: per
+    state, the change of r at a given z from the beginning to the end of the log, see `drift`. copies: trajectories, or rows,
+    that are in the log twice, and count once. `hint`: what to do next.
     """
 
     verdict: Literal["holds", "violated", "outside"]
@@ -158,10 +167,14 @@ class Check:
     drift: Mapping[str, Mapping[str, Any] | None]
     noise: Mapping[str, float] = field(default_factory=dict)
     hint: str = ""
+    units: int = 0
+    allowed: int = 0
+    copies: tuple[str, ...] = ()
 
     def summary(self) -> dict[str, Any]:
         """The JSON contract of `gapcert check`."""
-        return {**vars(self), "violations": list(self.violations), "drift": dict(self.drift), "noise": dict(self.noise)}
+        lists = {"violations": list(self.violations), "copies": list(self.copies)}
+        return {**vars(self), **lists, "drift": dict(self.drift), "noise": dict(self.noise)}
 
 
 def check(certified: Certified, recording: Recording, noise: Mapping[str, float] | None = None) -> Check:
@@ -171,8 +184,10 @@ def check(certified: Certified, recording: Recording, noise: Mapping[str, float]
     measured residual then differs from that of the true states by at most n_i + Σ_j sup |∂f_i/∂z_j| n_j, which is allowed for;
     γ is that at the measured point.
     """
-    model, steps = certified.model, Transitions.of(certified.model, recording)
-    names = axes(model)
+    model = certified.model
+    copies = Copies.of(recording, [s.name for s in model.inputs])
+    recording = copies.without(recording)
+    steps, names = Transitions.of(model, recording), axes(model)
     stated = {**{n: e for n, e in recording.noise.items() if n in names}, **(noise or {})}
     if others := [n for n in stated if n not in names]:
         raise UsageError(f"noise: '{others[0]}' is no state or input; there are {', '.join(names)}")
@@ -189,12 +204,15 @@ def check(certified: Certified, recording: Recording, noise: Mapping[str, float]
     over = (excess > 0).any(axis=1)
     out = ~((r >= low - allowed) & (r <= high + allowed)).all(axis=1)
     n, k = int(inside.sum()), int(over.sum())
+    unit = _units(certified, steps, recording)[inside]
+    units, hit = len(np.unique(unit)), len(np.unique(unit[over]))
+    most = tolerated(certified.claim, units)
     unknown = r - (low + high) / 2  # without what the certificate knows of r
     drift = {s.name: _drift(unknown[:, i], gamma[:, i], z[inside]) for i, s in enumerate(model.states)}
     titles = [tr.name for tr in recording.trajectories]
     listed = _listed(steps, inside, r, gamma, excess, model, titles)
     made = Check(
-        "violated" if k else ("holds" if n else "outside"),
+        "violated" if hit > most else ("holds" if n else "outside"),
         n,
         int((~inside).sum()),
         steps.skipped,
@@ -205,8 +223,35 @@ def check(certified: Certified, recording: Recording, noise: Mapping[str, float]
         rate_limit(k, n) if n else None,
         drift,
         stated,
+        units=units,
+        allowed=most,
+        copies=copies.told,
     )
     return replace(made, hint=_hint(made, _noisy(steps, unknown, inside, model)))
+
+
+def tolerated(claim: Claim | None, units: int) -> int:
+    """With how many violations among so many units a claim still stands at its own level.
+
+    A statistical one is refuted by v where P(Bin(units, ε) ≥ v) ≤ β, or ≤ 1e-6 where it states no β, as if units were
+    independent and of its distribution. All others are about every transition.
+    """
+    if claim is None or claim.kind != "statistical" or claim.epsilon is None or not units:
+        return 0
+    level = {} if claim.beta is None else {"level": claim.beta}
+    return order_statistics.surprising(units, claim.epsilon, **level) - 1
+
+
+def _units(certified: Certified, steps: Transitions, recording: Recording) -> Ints:
+    """Which unit of the claim each transition (n,) is of: itself, its window, or its trajectory."""
+    claim = certified.claim
+    if claim is None or claim.distribution not in (order_statistics.WINDOWS, order_statistics.DRAWN_WINDOWS):
+        return np.arange(len(steps))
+    if certified.window is None:
+        return steps.trajectory
+    first = np.array([np.nanmin(tr.t) for tr in recording.trajectories])[steps.trajectory]
+    number = np.floor((steps.t - first) / certified.window + 1e-9).astype(np.int64)
+    return np.unique(np.stack([steps.trajectory, number], axis=1), axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def rate_limit(k: int, n: int, confidence: float = THRESHOLDS.confidence) -> float:
@@ -242,33 +287,6 @@ def _listed(
     )
 
 
-def _drift(r: Array, gamma: Array, z: Array) -> dict[str, Any] | None:
-    """How much r (without what is known of it) changes along the log: its slope over time beside a quadratic function of z.
-
-    What neighbours share counts once: the slope's error comes from sums over `drift_stretches` stretches. A trend is one that
-    is sure and at least `drift_share` of the median γ.
-    """
-    from scipy.stats import t as student
-
-    if len(r) < 4 * THRESHOLDS.drift_stretches or not np.isfinite(r).all():
-        return None
-    spread = z.std(axis=0)
-    w = (z - z.mean(axis=0))[:, spread > 0] / spread[spread > 0]
-    first, second = np.triu_indices(w.shape[1])
-    design = np.hstack([np.ones((len(w), 1)), w, w[:, first] * w[:, second]])
-    if len(r) < 4 * design.shape[1]:
-        return None
-    time = np.linspace(-0.5, 0.5, len(r))
-    both = np.stack([time, r], axis=1)
-    time, left = (both - design @ np.linalg.lstsq(design, both, rcond=None)[0]).T
-    size = float(time @ time)
-    change = float(time @ left) / size
-    scores = [float(s.sum()) for s in np.array_split(time * (left - change * time), THRESHOLDS.drift_stretches)]
-    error = float(np.linalg.norm(scores)) / size
-    sure = abs(change) > error * float(student.ppf((1 + THRESHOLDS.drift_level) / 2, THRESHOLDS.drift_stretches - 1))
-    return {"change": change, "error": error, "trend": bool(sure and abs(change) > THRESHOLDS.drift_share * np.median(gamma))}
-
-
 def _hint(found: Check, noisy: Mapping[str, float]) -> str:
     if found.verdict == "outside":
         return (
@@ -286,6 +304,11 @@ def _hint(found: Check, noisy: Mapping[str, float]) -> str:
         return (
             f"γ is exceeded in {', '.join(states)}: run `gapcert diagnose` on a spec with this model and `recording:` of this "
             f"log to learn why."
+        )
+    if found.violated:
+        return (
+            f"γ is exceeded, but no more often than the claim allows: its ε is refuted by violations in more than "
+            f"{found.allowed} of {found.units:,}."
         )
     if trends := [n for n, d in found.drift.items() if d is not None and d["trend"]]:
         return f"The residual of {', '.join(trends)} drifts along the log, still below γ; `gapcert diagnose` may tell why."
@@ -321,6 +344,7 @@ def in_words(found: Check) -> list[str]:
     worst = sorted(found.violations, key=lambda v: -v["size"] / max(v["gamma"], 1e-300))[:5]
     lines += [f"  t = {v['t']:.6g} s: |r| of {v['state']} is {v['size']:.4g}, γ is {v['gamma']:.4g}" for v in worst]
     trends = {n: d for n, d in found.drift.items() if d is not None and d["trend"]}
+    lines += [f"  counted once: {copy}" for copy in found.copies]
     lines += [f"  {n} drifts by {d['change']:.3g} (± {d['error']:.2g}) along the log" for n, d in trends.items()]
     return [*lines, *([found.hint] if found.hint else [])]
 

@@ -8,6 +8,7 @@ from gapcert.plugin import LazyPackage, homes
 
 _HOME = homes(
     {
+        "gapcert_recordings.copies": "Copies Copy",
         "gapcert_recordings.experiment": "play",
         "gapcert_recordings.inspect": "Column Table in_words inspect not_numbers sentence",
         "gapcert_recordings.resampling": "JITTER Log Piece pieces repairs",

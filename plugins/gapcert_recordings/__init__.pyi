@@ -1,3 +1,5 @@
+from gapcert_recordings.copies import Copies as Copies
+from gapcert_recordings.copies import Copy as Copy
 from gapcert_recordings.experiment import play as play
 from gapcert_recordings.inspect import Column as Column
 from gapcert_recordings.inspect import Table as Table

@@ -145,7 +145,7 @@ def test_a_model_without_inputs_can_be_calibrated() -> None:
     domain = gc.Domain.of(model, {"z": (0.1, 0.26), "vz": (-1.6, 0.6)})
     c = gc.calibrate_recording(model, log, domain, violation=0.05)
     assert all(s.overpowered is None for s in c.states.values())
-    assert c.rank == 241
+    assert c.rank == 232  # of 379 tosses, 14 are in the data twice
 
 
 def test_too_few_windows_say_how_many_are_needed() -> None:

@@ -1,0 +1,73 @@
+"""Does a residual change along a log? A trend beside a function of z, against errors that neighbours may share."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.stats import t as student
+
+from gapcert import Array
+from gapcert_monitor.thresholds import THRESHOLDS
+
+
+def drift(r: Array, gamma: Array, z: Array) -> dict[str, Any] | None:
+    """How much r (n,), without what is known of it, changes along the log: its slope over time beside a quadratic function of
+    z (n, nz). {"change", "error", "samples", "trend"}, or None with too few points.
+
+    A trend is sure where two errors of the slope agree on it, and told where it is at least `drift_share` of the median γ.
+    One takes what is left for an AR(1) process, whose ρ is at the upper end of what is likely: n transitions tell as much as
+    n (1 − ρ) / (1 + ρ) independent ones, `samples`. The other takes nothing for granted but that what is slow is about as
+    large at the `drift_waves` lowest frequencies as at that of a trend: of white noise it makes an exact t-test.
+    """
+    n = len(r)
+    if n < THRESHOLDS.drift_points or not np.isfinite(r).all():
+        return None
+    known = _known(z)
+    k = known.shape[1] + 1
+    if n < 4 * k:
+        return None
+    time = np.linspace(-0.5, 0.5, n)
+    time, left = (v - known @ (known.T @ v) for v in (time, r))
+    size = float(time @ time)
+    if size < n * THRESHOLDS.drift_apart:
+        return None
+    change = float(time @ left) / size
+    left = left - change * time
+    samples = _independent(left, k)
+    if (freedom := samples - k) < THRESHOLDS.drift_freedom:
+        return {"change": change, "error": None, "samples": samples, "trend": False}
+    # n − k of its n squares are left by k regressors where samples are independent; of fewer, k take a larger share.
+    errors = float(np.sqrt(left @ left / freedom / size)), _slow(left, known, time) / float(np.sqrt(size))
+    level = (1 + THRESHOLDS.drift_level) / 2
+    sure = all(abs(change) > e * student.ppf(level, f) for e, f in zip(errors, (freedom, THRESHOLDS.drift_waves), strict=True))
+    told = bool(sure and abs(change) > THRESHOLDS.drift_share * np.median(gamma))
+    return {"change": change, "error": max(errors), "samples": samples, "trend": told}
+
+
+def _known(z: Array) -> Array:
+    """An orthonormal basis (n, k) of the quadratic functions of z at its points."""
+    spread = z.std(axis=0)
+    w = (z - z.mean(axis=0))[:, spread > 0] / spread[spread > 0]
+    first, second = np.triu_indices(w.shape[1])
+    basis, size, _ = np.linalg.svd(np.hstack([np.ones((len(w), 1)), w, w[:, first] * w[:, second]]), full_matrices=False)
+    return np.asarray(basis[:, size > 1e-9 * size[0]])
+
+
+def _independent(left: Array, k: int) -> float:
+    """How many independent samples tell as much of a mean as what k regressors have left, (n,).
+
+    ρ̂ of neighbours errs by √((1 − ρ²) / n) and is too small by about (k + (k + 2) ρ) / n [Kendall 1954 for k = 1].
+    """
+    n = len(left)
+    found = float(left[1:] @ left[:-1]) / max(float(left @ left), np.finfo(float).tiny)
+    rho = found + (k + (k + 2) * abs(found)) / n + THRESHOLDS.drift_doubt * float(np.sqrt(max(1 - found**2, 0.0) / n))
+    return n * (1 - rho) / (1 + rho) if 0 < rho < 1 else n * float(rho <= 0)
+
+
+def _slow(left: Array, known: Array, time: Array) -> float:
+    """The standard deviation of what is left along each of the lowest cosines that the regressors leave."""
+    waves = np.cos(np.pi * np.outer(np.arange(len(left)) + 0.5, np.arange(1, THRESHOLDS.drift_waves + 1)) / len(left))
+    regressors = np.column_stack([known, time / np.linalg.norm(time)])
+    basis = np.linalg.qr(waves - regressors @ (regressors.T @ waves))[0]
+    return float(np.sqrt(np.mean((basis.T @ left) ** 2)))

@@ -1,0 +1,323 @@
+"""The same measurement twice: trajectories, or stretches of them, that hold the values of another, noise included.
+
+Found by content, whatever their names, clocks, lengths, formats and digits are. A repetition of one command is no copy, since
+what is measured has noise of its own; nor are two logs that stand still at the same values.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import final
+
+import numpy as np
+import numpy.typing as npt
+
+from gapcert.plugin import SHORTEST, Array, Bools, Recording, Trajectory
+from gapcert_recordings.thresholds import THRESHOLDS
+
+Rows = npt.NDArray[np.intp]
+_EPS = float(np.finfo(np.float64).eps)
+
+
+@final
+@dataclass(frozen=True)
+class Copy:
+    """`rows` rows of trajectory `name`, from `start` s on, hold what is in trajectory `of`; whole: there are no others."""
+
+    name: str
+    of: str
+    start: float
+    rows: int
+    whole: bool
+
+    def __str__(self) -> str:
+        part = "is" if self.whole else f"has {self.rows} rows from {self.start:.6g} s on that are"
+        return f"'{self.name}' {part} a copy of {'' if self.whole else 'rows of '}'{self.of}'"
+
+
+@final
+@dataclass(frozen=True)
+class Copies:
+    """What counts once: found, and per trajectory which of its rows (T,) are in another one that counts."""
+
+    found: tuple[Copy, ...]
+    rows: tuple[Bools, ...]
+
+    @classmethod
+    def of(
+        cls, recording: Recording, inputs: Collection[str] = (), first: Collection[int] = (), within: bool = False
+    ) -> Copies:
+        """Longer trajectories count before shorter ones, and then those that were read before; those in `first` before all.
+
+        inputs: channels that are commanded, which may be the same to the last bit in two different measurements. within: are
+        rows compared with those of their own trajectory, too?
+        """
+        series = [_Series.of(tr, inputs) for tr in recording.trajectories]
+        order = sorted(range(len(series)), key=lambda i: (i not in first, -len(series[i].t), series[i].coarse, i))
+        rows, found = tuple(np.zeros(len(s.t), dtype=bool) for s in series), dict[tuple[int, int], Rows]()
+        # Few neighbours are looked up of a row: more copies of it are found once these are left out.
+        while new := _found(series, [i for i in order if not rows[i].all()], rows, within):
+            found |= new
+        titles = _titles(recording.trajectories)
+        told = []
+        for (a, b), k in found.items():
+            tr = recording.trajectories[b]
+            told.append(Copy(titles[b], titles[a], float(tr.t[k[0]]), len(k), len(k) == len(tr)))
+        return cls(tuple(told), rows)
+
+    def kept(self, tr: Trajectory, number: int) -> Trajectory | None:
+        """What counts of the trajectory of that number, without values in rows that are copies; None where too few are left."""
+        rows = self.rows[number]
+        left = {n: np.where(rows, np.nan, v) for n, v in tr.channels.items()}
+        enough = all(np.isfinite(v).sum() >= SHORTEST for v in left.values())
+        return tr if not rows.any() else replace(tr, channels=left) if enough else None
+
+    def without(self, recording: Recording) -> Recording:
+        """What counts of all trajectories."""
+        kept = (self.kept(tr, i) for i, tr in enumerate(recording.trajectories))
+        return replace(recording, trajectories=tuple(tr for tr in kept if tr is not None)) if self.found else recording
+
+    @property
+    def told(self) -> tuple[str, ...]:
+        """A sentence for each, and one for those beyond the `copies_told` first."""
+        most = THRESHOLDS.copies_told
+        more = (f"and {len(self.found) - most} more",) if len(self.found) > most else ()
+        return tuple(map(str, self.found[:most])) + more
+
+
+def _titles(trajectories: Sequence[Trajectory]) -> list[str]:
+    """Names, with a number where several share one."""
+    names = [tr.name for tr in trajectories]
+    return [f"{n} ({names[: i + 1].count(n)})" if names.count(n) > 1 else n for i, n in enumerate(names)]
+
+
+@final
+@dataclass(frozen=True)
+class _Series:
+    """A trajectory as it was written: values (T, c), by the names of the channels; `measured` (c,) are not commanded.
+
+    forms: how the values of each channel are written; quantum (T, c): by how much a value differs from the next that can be.
+    """
+
+    t: Array
+    values: Array
+    measured: Bools
+    forms: tuple[tuple[int, int, bool], ...]
+    quantum: Array
+
+    @classmethod
+    def of(cls, tr: Trajectory, inputs: Collection[str]) -> _Series:
+        names = sorted(tr.channels)
+        values = np.stack([tr.channels[n] for n in names], axis=1)
+        forms = tuple(_form(v) for v in values.T)
+        quantum = np.stack([_quantum(v, form) for v, form in zip(values.T, forms, strict=True)], axis=1)
+        return cls(tr.t, values, np.array([n not in inputs for n in names]), forms, quantum)
+
+    @property
+    def coarse(self) -> float:
+        """How much of each value its digits leave open, on the whole."""
+        return float(np.mean(self.quantum / np.maximum(np.nanmax(np.abs(self.values), axis=0), np.finfo(np.float64).tiny)))
+
+    @cached_property
+    def moves(self) -> Bools:
+        """(T, c): where a value is another than that of the row before."""
+        there = np.isfinite(self.values)
+        moved = (self.values[1:] != self.values[:-1]) & there[1:] & there[:-1]
+        return np.vstack([np.zeros((1, self.values.shape[1]), dtype=bool), moved])
+
+    @cached_property
+    def bits(self) -> Array:
+        """(c,): what it tells, at least, that another measurement changes to the same value in the same row.
+
+        A half by chance where the noise is below the step of the values, and less by the size of the noise where it is above.
+        """
+        from .smoothing import noise_floor
+
+        out = np.ones(self.values.shape[1])
+        for j, v in enumerate(self.values.T):
+            known = v[np.isfinite(v)]
+            unique = np.unique(known)
+            apart = np.diff(unique)[np.diff(unique) > 1e-9 * np.ptp(unique)] if len(unique) > 1 else np.zeros(0)
+            if len(apart):
+                out[j] += np.log2(1 + max(noise_floor(known), 0.0) / max(apart.min(), np.nanmedian(self.quantum[:, j])))
+        return np.where(self.measured, out, 0.0)
+
+
+def _form(v: Array) -> tuple[int, int, bool]:
+    """(digits behind the point, digits in all, is it single precision?) with which values (T,) are written; 17 where more."""
+    known = v[np.isfinite(v) & (v != 0)]
+    some = known[:: max(1, len(known) // THRESHOLDS.form_values)]
+    near = 4 * _EPS * np.abs(some)
+    behind = next((d for d in range(13) if (np.abs(np.round(some, d) - some) <= near).all()), 17)
+    with np.errstate(over="ignore", under="ignore"):
+        power = 10.0 ** np.floor(np.log10(np.abs(some)))
+        digits = next((d for d in range(1, 15) if (np.abs(np.round(some / power, d - 1) * power - some) <= near).all()), 17)
+        return behind, digits, bool((some.astype(np.float32) == some).all()) and digits == 17
+
+
+def _quantum(v: Array, form: tuple[int, int, bool]) -> Array:
+    """(T,)"""
+    behind, digits, single = form
+    size = np.maximum(np.abs(np.nan_to_num(v)), np.finfo(np.float64).tiny)
+    out = 4 * _EPS * size
+    if single:
+        out = np.maximum(out, np.spacing(size.astype(np.float32)).astype(np.float64))
+    if behind < 17:
+        out = np.maximum(out, 10.0**-behind)
+    return np.maximum(out, 10.0 ** (np.floor(np.log10(size)) - digits + 1)) if digits < 17 else out
+
+
+def _found(series: Sequence[_Series], order: Sequence[int], rows: Sequence[Bools], within: bool) -> dict[tuple[int, int], Rows]:
+    """(a, b): rows of b that are in a, an earlier one of the order; they are marked."""
+    kept, found = [series[i] for i in order], dict[tuple[int, int], Rows]()
+    if len(kept) == 1 and not within:
+        return found
+    for (j, k), places in sorted(_meetings(kept, within).items(), key=lambda item: item[0][::-1]):
+        a, b = order[j], order[k]
+        own = np.any([_shared(kept[j], kept[k], at, rows[a]) for at in places], axis=0) & ~rows[b]
+        if own.any():
+            found[a, b] = np.flatnonzero(own)
+            rows[b][own] = True
+    return found
+
+
+def _meetings(series: Sequence[_Series], within: bool) -> dict[tuple[int, int], list[Array]]:
+    """Of trajectories (a, b), a before b, that may share rows: where in a, in rows, those of b (T,) would be.
+
+    Where several rows lie alike, and as far apart in both, they are worth a look. Trajectories may be sampled at other rates.
+    """
+    found: dict[tuple[int, int], list[Array]] = {}
+    periods = [float(np.median(np.diff(s.t))) for s in series]
+    points = _scaled(series)
+    slower = _distinct(periods) if len(_distinct(periods)) > 1 else []
+    for slowest in [0.0, *slower]:
+        # First row by row, whatever the clocks say; then every so many rows of those that are sampled faster.
+        ratio = [slowest / period if slowest and period > 0 else 1.0 for period in periods]
+        every = {i: round(r) for i, r in enumerate(ratio) if r > 0.98 and abs(r - round(r)) < 0.02 * r}
+        if slowest and max(every.values()) == 1:
+            continue
+        for a, b, shift in _alike(points, every, within):
+            rows = np.arange(len(series[b].t))
+            if every[b] == 1:
+                found.setdefault((a, b), []).append(every[a] * rows + float(shift))
+            elif every[a] == 1:
+                found.setdefault((a, b), []).append((rows - float(shift)) / every[b])
+    for a, b in itertools.combinations(range(len(series)), 2) if slower else ():
+        if abs(periods[a] - periods[b]) > 0.02 * periods[a]:
+            found.setdefault((a, b), []).extend(_resampled(series[a], series[b]))
+    return found
+
+
+def _distinct(periods: Sequence[float]) -> list[float]:
+    """Those that differ by more than what clocks do."""
+    out: list[float] = []
+    for period in sorted((p for p in periods if p > 0), reverse=True):
+        if not out or period < 0.98 * out[-1]:
+            out.append(period)
+    return out
+
+
+def _scaled(series: Sequence[_Series]) -> list[Array]:
+    """Values (T, c) of the channels that tell most, in units of what their digits leave open."""
+    every, quantum = (np.concatenate([getattr(s, n) for s in series]) for n in ("values", "quantum"))
+    alike = np.array([len({s.forms[j] for s in series}) == 1 for j in range(every.shape[1])])
+    size = np.abs(np.nan_to_num(every)).max(axis=0)
+    open_ = np.where(alike, 8 * _EPS * size, 2 * quantum.max(axis=0)) + np.finfo(np.float64).tiny
+    told = np.array([len(np.unique(column)) for column in every.T])
+    best = np.argsort(-told - len(every) * series[0].measured, kind="stable")[: THRESHOLDS.copy_channels]
+    return [np.nan_to_num(s.values[:, best]) / open_[best] for s in series]
+
+
+def _alike(points: Sequence[Array], every: Mapping[int, int], within: bool) -> Iterator[tuple[int, int, int]]:
+    """(a, b, shift): of what a and b have every so many rows, rows i of a and j of b, i = every_a·j + shift, or the reverse."""
+    from scipy.spatial import cKDTree
+
+    parts, rows, of = [], [], []
+    for i, step in every.items():
+        last = len(points[i]) - 3 * THRESHOLDS.copy_lag * step
+        lagged = [points[i][k * THRESHOLDS.copy_lag * step :][: max(last, 0)] for k in range(4)]
+        moving = np.flatnonzero(np.any([(lagged[0] != later).any(axis=1) for later in lagged[1:]], axis=0))
+        # Of rows that are the same, those of neighbours in the order are the nearest.
+        place = np.full((len(moving), 1), 0.5 * i / len(points))
+        parts.append(np.hstack([*(part[moving] for part in lagged), place]))
+        rows.append(moving)
+        of.append(np.full(len(moving), i))
+    z, row, number = np.concatenate(parts), np.concatenate(rows), np.concatenate(of)
+    if len(z) < 2:
+        return
+    asked = np.arange(0, len(z), 1 + len(z) // THRESHOLDS.copy_queries)
+    tree = cKDTree(z, balanced_tree=False, compact_nodes=False)
+    near = tree.query(z[asked], k=THRESHOLDS.copy_neighbours, p=np.inf, distance_upper_bound=1.0 + 1e-6)[1]
+    i, j = np.repeat(asked, near.shape[1]), near.reshape(-1)
+    i, j = i[j < len(z)], j[j < len(z)]
+    steps = np.array([every.get(k, 0) for k in range(len(points))])
+    swap = (number[i] > number[j]) | ((number[i] == number[j]) & (row[i] > row[j]))
+    i, j = np.where(swap, j, i), np.where(swap, i, j)
+    a, b = number[i], number[j]
+    shift = np.where(steps[b] == 1, row[i] - steps[a] * row[j], row[j] - steps[b] * row[i])
+    apart = (a != b) | (within & (np.abs(row[i] - row[j]) >= THRESHOLDS.copy_apart))
+    met, votes = np.unique(np.stack([a, b, shift], axis=1)[apart], axis=0, return_counts=True)
+    yield from (tuple(m) for m in met[votes >= THRESHOLDS.copy_votes].tolist())
+
+
+def _resampled(a: _Series, b: _Series) -> list[Array]:
+    """Where rows of b would be in a by their clocks, or had both begun or ended together."""
+    shifts = {0.0, float(b.t[0] - a.t[0]), float(b.t[-1] - a.t[-1])}
+    if not ((np.diff(a.t) > 0).all() and np.isfinite(a.t).all() and np.isfinite(b.t).all()):
+        return []
+    return [np.interp(b.t - shift, a.t, np.arange(len(a.t)), left=-1.0, right=-1.0) for shift in shifts]
+
+
+def _shared(a: _Series, b: _Series, at: Array, marked: Bools) -> Bools:
+    """(T,): which rows of b are those at places `at` (T,) of a, in stretches that tell enough.
+
+    What a row that is marked is itself a copy of is equal to b as well only where nothing was rounded.
+    """
+    out = np.zeros(len(at), dtype=bool)
+    coarse = len(at) > 1 and 0 < at[1] - at[0] < 0.98
+    known = np.flatnonzero((at >= 0) & (at <= len(a.t) - 1) & (not coarse or np.abs(at - np.round(at)) < 0.01))
+    if len(known) < THRESHOLDS.copy_rows:
+        return out
+    same = _equal(a, b, at, known)
+    if a.forms != b.forms:
+        same &= ~marked[np.round(at[known]).astype(np.intp)]
+    event = np.where(np.isfinite(a.values[np.round(at[known]).astype(np.intp)]), b.moves[known] * b.bits, 0.0).max(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]])))
+    for start, stop in edges.reshape(-1, 2).tolist():
+        own = event[start:stop]
+        if stop - start >= THRESHOLDS.copy_rows and _told(
+            own, np.delete(same, np.s_[start:stop]), np.delete(event, np.s_[start:stop])
+        ):
+            out[known[start] : known[stop - 1] + 1] = True
+    return out
+
+
+def _told(bits: Array, same: Bools, event: Array) -> bool:
+    """Do the rows of a stretch, with what each tells (n,), tell enough? Beside them in the same alignment: which are the same.
+
+    Where steps are coarse and noise is small, two measurements may agree in many rows; the others show in how many.
+    """
+    others = same[event > 0]
+    if len(others) >= THRESHOLDS.copy_rows:
+        chance = -np.log2((others.sum() + 1) / (len(others) + 2))
+        bits = np.where(bits < THRESHOLDS.copy_coarse, np.minimum(bits, chance), bits)
+    return bool(bits[1:].sum() >= THRESHOLDS.copy_bits)
+
+
+def _equal(a: _Series, b: _Series, at: Array, known: Rows) -> Bools:
+    """Which of the `known` rows of b are, channel by channel, within what the digits of both leave open."""
+    place = at[known]
+    low = np.minimum(np.floor(place).astype(np.intp), len(a.t) - 1)
+    high, part = np.minimum(low + 1, len(a.t) - 1), (place - low)[:, None]
+    value, own = a.values[low], b.values[known]
+    step = np.where(part > 0, a.values[high] - value, 0.0)
+    alike = np.array([p == q for p, q in zip(a.forms, b.forms, strict=True)])
+    rounded = np.where(alike & (part == 0), 0.0, a.quantum[low] + b.quantum[known])
+    # Where rows lie between others, the digits of the times count as well.
+    clock = sum(float(_quantum(s.t, _form(s.t)).max()) for s in (a, b)) / float(np.median(np.diff(a.t)))
+    allowed = rounded + 8 * _EPS * np.abs(own) + np.abs(step) * clock
+    # A value that is missing contradicts none.
+    return np.asarray(~(np.abs(value + part * step - own) > allowed).any(axis=1))
