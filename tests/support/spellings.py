@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -33,7 +34,9 @@ def drawn(rng: Draws) -> Spec:
     f = {s: sum_of([f"{s}", *(term(rng, axes) for _ in range(rng.integers(1, 3)))]) for s in states}
     fhat = {s: sum_of([text, *(term(rng, axes, 0.05) for _ in range(rng.integers(0, 3)))]) for s, text in f.items()}
     # Half of the ranges are equal, so that their order tells nothing.
-    ranges = {n: [-same[0], same[0]] if rng.random() < 0.5 else sorted(np.round(rng.uniform(-4, 4, 2), 3).tolist()) for n in axes}
+    ranges = {
+        n: [-same[0], same[0]] if rng.random() < 0.5 else sorted(np.round(rng.uniform(-4, 4, 2), 3).tolist()) for n in axes
+    }
     spec = {
         "version": 1,
         "name": "drawn",
@@ -41,7 +44,7 @@ def drawn(rng: Draws) -> Spec:
         "backend": system(states, inputs, unit, fhat),
         "domain": {n: r if r[1] - r[0] > 0.1 else [-1.0, 1.0] for n, r in ranges.items()},
     }
-    pairs = [(a, b) for a, b in zip(axes, axes[1:], strict=False) if unit[a] == unit[b]]
+    pairs = [(a, b) for a, b in itertools.pairwise(axes) if unit[a] == unit[b]]
     if rng.random() < 0.3 and pairs:
         a, b = pairs[0]
         centre = sum(sum(spec["domain"][n]) / 2 for n in (a, b))
@@ -87,7 +90,9 @@ def texts(spec: Spec, change: Callable[[str], str]) -> None:
 
 def renamed(spec: Spec, rng: Draws) -> None:
     names = [*spec["model"]["states"], *spec["model"]["inputs"]]
-    new = dict(zip(names, rng.permutation([f"{w}_{k}" for k, w in enumerate("abcdefghijk"[: len(names)])]).tolist(), strict=True))
+    new = dict(
+        zip(names, rng.permutation([f"{w}_{k}" for k, w in enumerate("abcdefghijk"[: len(names)])]).tolist(), strict=True)
+    )
 
     def changed(text: str) -> str:
         return re.sub("|".join(WORD.format(n) for n in names), lambda m: new[m[0]], text)
@@ -134,7 +139,7 @@ def rewritten(spec: Spec, rng: Draws) -> None:
             lambda: str(sympy.expand(3 * e) / 3),
             lambda: f"({text})*2/2",
             lambda: f"1.5*({text}) - 0.5*({text})",
-            lambda: " + ".join(reversed(text.split(" + "))),
+            lambda: str(sympy.Add(*reversed(sympy.Add.make_args(e)), evaluate=False)),
             lambda: f"({text}) + 0",
             lambda: re.sub(r"(\w+)\*\*2", r"\1*\1", text),
         )
@@ -146,11 +151,14 @@ def rewritten(spec: Spec, rng: Draws) -> None:
 
 def with_parameters(spec: Spec, rng: Draws) -> None:
     for part in (spec["model"], spec["backend"]):
-        found = sorted(set(re.findall(r"(?<![\w.*])\d+\.\d+(?=\*)", " ".join(part["next"].values()))))[: int(rng.integers(1, 4))]
+        found = sorted(set(re.findall(r"(?<![\w.*])\d+\.\d+(?=\*)", " ".join(part["next"].values()))))[
+            : int(rng.integers(1, 4))
+        ]
         part.setdefault("parameters", {}).update({f"k{part['period'][0]}{k}_": float(v) for k, v in enumerate(found)})
         for k, v in enumerate(found):
             part["next"] = {
-                s: re.sub(rf"(?<![\w.*]){re.escape(v)}(?=\*)", f"k{part['period'][0]}{k}_", text) for s, text in part["next"].items()
+                s: re.sub(rf"(?<![\w.*]){re.escape(v)}(?=\*)", f"k{part['period'][0]}{k}_", text)
+                for s, text in part["next"].items()
             }
 
 
