@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calibrating import RANGES, TOO_LARGE, TOO_SMALL, UNIFORM, calibrated, declared, family
+from calibrating import TOO_LARGE, TOO_SMALL, UNIFORM, calibrated, declared, family
 from forging import edit_json, failed
 
 import gapcert as gc
