@@ -192,7 +192,7 @@ class CalibratedRecording(SavedStatement):
                 f"this is calibration {self.entry.k} on the same measurements; fresh ones cannot be drawn from a recording, so "
                 f"that one which was chosen by its figures claims too much"
             )
-        return [*said, *(() if self.entry is None else self.entry.warnings)]
+        return [*said, *([] if self.entry is None else self.entry.warnings)]
 
     def digest(self) -> str:
         """Identity of the band and of its claim."""
@@ -288,12 +288,13 @@ def calibrate_recording(
 
 
 def content(made: CalibratedRecording) -> tuple[int, ...]:
-    """What stands for the measurements behind a calibration: the smallest hashes of its transitions, in whatever order, names and
-    units these were written. Two recordings share as many of these as of all (Broder 1997)."""
+    """What stands for the measurements behind a calibration: the smallest hashes of its transitions, whatever their order,
+    names and units. Two recordings have as large a part of these in common as of all (Broder 1997).
+    """
     low, width = made.domain.low, made.domain.width
     z, r = (np.concatenate([getattr(part, k) for part in (made.fit, made.held)]) for k in ("z", "r"))
-    # Shares of the ranges, so that units do not count, sorted, so that the order of the axes does not; and rounded to a number that
-    # no logger rounds to, so that few lie between two.
+    # Shares of the ranges, so that units do not count; sorted, so that the order of the axes does not; and rounded as no logger
+    # rounds, so that few lie between two.
     shares = np.hstack([np.sort((z - low) / width, axis=1), np.sort(r / width[: r.shape[1]], axis=1)])
     rows = np.round(shares * 790_569.4).astype(np.int64)
     return tuple(sorted({int(hashlib.sha256(row.tobytes()).hexdigest()[:16], 16) for row in rows})[:_SKETCH])

@@ -169,7 +169,7 @@ class Calibration(Record):
             f"It is about that distribution alone: it does not carry over to others, nor to a closed loop, which may stay in "
             f"the part that was missed. The audit's {len(audited.z)} points, drawn afterwards in the same way, are a second "
             f"look: {audited.violations} lie outside, and {audited.limit + 1} or more would refute the claim.",
-            *self.entry.sentences,
+            *(f"Warning: {w}." for w in self.entry.warnings),
         ]
 
 

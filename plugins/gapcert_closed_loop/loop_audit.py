@@ -62,7 +62,7 @@ def audited(failed: Bools, beta: float, steps: int, policies: tuple[str, ...], e
     """
     n, v, spent = len(failed), int(failed.sum()), beta / 2 ** (0 if entry is None else entry.k)
     claim = Claim("statistical", largest(v, n, spent), beta, f"{STARTS} × policies {', '.join(policies)}, {steps} steps")
-    warned = {} if entry is None or not entry.warnings else {"warnings": list(entry.warnings)}
+    warned = {} if entry is None or not entry.warnings else {"warnings": entry.warnings}
     return {**claim.summary(), "runs": n, "violations": v, **({} if entry is None else entry.summary()), **warned}
 
 

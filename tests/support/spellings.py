@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -43,7 +44,7 @@ def drawn(rng: Draws) -> Spec:
         "backend": system(states, inputs, unit, fhat),
         "domain": {n: r if r[1] - r[0] > 0.1 else [-1.0, 1.0] for n, r in ranges.items()},
     }
-    pairs = [(a, b) for a, b in zip(axes, axes[1:], strict=False) if unit[a] == unit[b]]
+    pairs = [(a, b) for a, b in itertools.pairwise(axes) if unit[a] == unit[b]]
     if rng.random() < 0.3 and pairs:
         a, b = pairs[0]
         centre = sum(sum(spec["domain"][n]) / 2 for n in (a, b))
@@ -138,7 +139,7 @@ def rewritten(spec: Spec, rng: Draws) -> None:
             lambda: str(sympy.expand(3 * e) / 3),
             lambda: f"({text})*2/2",
             lambda: f"1.5*({text}) - 0.5*({text})",
-            lambda: " + ".join(reversed(text.split(" + "))),
+            lambda: str(sympy.Add(*reversed(sympy.Add.make_args(e)), evaluate=False)),
             lambda: f"({text}) + 0",
             lambda: re.sub(r"(\w+)\*\*2", r"\1*\1", text),
         )

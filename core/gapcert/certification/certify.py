@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, final
 
 import numpy as np
+from numpy.random import Generator
 
 from gapcert.certification.certificate import Audit, Certificate, Record, figures, gap_digest, points_refute
 from gapcert.certification.compatibility import refuse, unpaired
@@ -73,9 +74,9 @@ def certify(
     `declared` takes γ as it is stated, without constants: samples, audit and attack may refute it, and its claim is `assumed`.
     `predictor` overrides the family's; a Model there is an extended model. `hidden`: what is done where hidden state matters
     (default: refuse); hidden states that the domain names become states. `symmetries`: axes along which the residual is
-    declared not to change; that is checked on pairs before it saves samples. Samples live in `folder`, the book of audits in the
-    file `ledger` (default: beside the folder), under `question` (default: that of model, backend and domain).
-    UsageError where the ingredients cannot give the claim.
+    declared not to change; that is checked on pairs before it saves samples. Samples live in `folder`, the audit ledger in the
+    file `ledger` (default: beside the folder), under `question` (default: that of model, backend and domain). UsageError where
+    the ingredients cannot give the claim.
     """
     known = registry()
     family = family or known.build("gap_family", "envelope")
@@ -263,9 +264,7 @@ def _judged(gap: GapFunction, z: Array, r: Array, pulse: Pulse) -> tuple[Bools, 
     return both[0], both[1]
 
 
-def attack(
-    gap: GapFunction, residual: Residual, domain: Domain, n: int, rng: np.random.Generator, emit: Emit = silent
-) -> dict[str, int]:
+def attack(gap: GapFunction, residual: Residual, domain: Domain, n: int, rng: Generator, emit: Emit) -> dict[str, int]:
     """Count violations on n further uniform points, drawn block by block; nothing is stored."""
     counts, block = {"points": 0, "violations": 0, "gamma_violations": 0}, 100_000
     while counts["points"] < n:

@@ -235,7 +235,7 @@ def _assumptions(basis: Sequence[str], problem: GapProblem, audited: Audit, mode
         scope(model, problem.domain),
         f"The audit's {len(audited.z)} points are independent and uniform on {problem.domain.words}{gate.distribution} (audit "
         f"{audited.k} of this question); its statement does not carry over to other distributions, nor to a closed loop.",
-        *audited.entry.sentences,
+        *(f"Warning: {w}." for w in audited.entry.warnings),
     ]
 
 

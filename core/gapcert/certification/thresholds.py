@@ -32,6 +32,7 @@ class Thresholds:
     hidden_steps: int = chosen(12, "of each of them")
     harmless_runs: int = chosen(16, "long rollouts, which lend an audit hidden states that seemed harmless")
     harmless_steps: int = chosen(256, "of each of them: what adds up over a closed loop shows by then")
+    hidden_attack: int = chosen(256, "points of an attack from other hidden states, and as many visited ones")
     spread_points: int = chosen(64, "at which the spread over hidden states is measured")
     spread_draws: int = chosen(16, "hidden states at each of these")
     repeat_error: float = chosen(64.0, "times what a step rounds by, that it may change with a turn: sums round more than once")
@@ -46,15 +47,18 @@ class Thresholds:
     response_error: float = chosen(0.1, "relative, between what an input moves in f̂ and in f: a warning, no refusal")
     response_rows: int = chosen(16, "states at which an input is moved from end to end")
     # fingerprint
-    question_points: int = threshold(64, "of Z, as the design has it: what f and f̂ answer there makes a question")
-    question_box: int = chosen(512, "of the box around Z, of which Z has the same in every spelling")
-    question_diagonal: int = chosen(8, "of the points, at one share of every axis: what differs there need not be ordered")
-    question_orders: int = chosen(720, "of axes with equal ranges that are tried: those of six")
+    question_points: int = threshold(64, "as the design has it: what f and f̂ answer at so many points of Z makes a question")
+    question_box: int = chosen(512, "points of the box around Z, of which Z has the same in every spelling")
+    question_diagonal: int = chosen(8, "of the points at one share of every axis")
+    question_orders: int = chosen(720, "of axes with equal ranges, those of six: after so many a question is the same")
     question_range: float = threshold(1e-9, "of the width, as the design has it: closer ranges are one")
     question_draws: int = chosen(16, "of noise at each point")
-    question_noise: float = threshold(2.0, "deviations, by the formula: means of 16 draws at 64 points differ by less, to 1e-7")
-    question_spread: float = threshold(0.2, "by the formula, six deviations of a ratio of spreads over 1024 draws")
-    question_shared: float = chosen(0.05, "of the transitions of two recordings that are one question")
+    question_noise: float = threshold(
+        0.5, "deviations: by the formula, means of 16 draws at 64 points differ by less than four"
+    )
+    question_spread: float = threshold(0.05, "by the formula: spreads of 1024 draws differ by less than four times this share")
+    question_shared: float = chosen(0.05, "of its hashes: recordings that have so many in common are one")
+    # samples
     # samples
     spread_grid: int = chosen(300, "points of a grid where nobody asks for another")
     refinement_rounds: int = chosen(8, "at most 9, since names of rounds are sorted as texts")

@@ -140,10 +140,9 @@ def unit_rank(n: int, epsilon: float, beta: float | None) -> int:
 
 
 def drawing(seed: int, k: int, stream: str, question: str = "", audited: str = "") -> np.random.Generator:
-    """What audit k of a question draws its points from: a hash of all of these, so that no fit can know them.
+    """What audit k of a question draws from: a hash, also of what is audited, so that no fit can know its points.
 
-    audited: the digest of what is audited. Without a question by the rule of books before format 2: from (seed, k), of a
-    calibration from (seed, k, STREAM).
+    Without a question by the rule of books before format 2: (seed, k), or (seed, k, STREAM) for a calibration.
     """
     if question:
         return np.random.default_rng(int(json_digest(seed, question, k, audited, stream), 16))

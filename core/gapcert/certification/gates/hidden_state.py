@@ -271,13 +271,7 @@ def spread(draws: HiddenDraws, domain: Domain, seed: int) -> Array:
 
 
 def attacked(
-    gate: Gate,
-    gap: GapFunction,
-    problem: GapProblem,
-    model: Model,
-    enter: Callable[[], Entry],
-    emit: Emit = silent,
-    n: int = 256,
+    gate: Gate, gap: GapFunction, problem: GapProblem, model: Model, enter: Callable[[], Entry], emit: Emit = silent
 ) -> Gate:
     """γ of the default hidden state, asked about others: the share of probes with |r| > γ, and the worst.
 
@@ -287,12 +281,11 @@ def attacked(
     """
     if gate.probe is None or gate.probe.harmless or gate.law is not None:
         return gate
-    backend, domain, entry = gate.system, problem.domain, enter()
+    backend, domain, entry, n = gate.system, problem.domain, enter(), THRESHOLDS.hidden_attack
     rng = entry.draws(problem.seed, "hidden state")
     x, u = (np.ascontiguousarray(part) for part in domain.split(domain.draw(n, rng)))
     pulse = Pulse(emit, "attack", THRESHOLDS.hidden_steps + -(-2 * n // _BLOCK), "steps", "from other hidden states")
-    runs, started = max(THRESHOLDS.hidden_runs, n // 8), int(rng.integers(2**32))
-    met = visited(backend, domain, runs, THRESHOLDS.hidden_steps, started, pulse)
+    met = visited(backend, domain, n // 8, THRESHOLDS.hidden_steps, int(rng.integers(2**32)), pulse)
     parts = [(x, u, moved(backend, n, rng, gate.plan.ranges)), _met(domain, met, rng, n)]
     x, u, h = (np.concatenate(part) for part in zip(*parts, strict=True))
     gamma, after = gap.gamma(np.hstack([x, u])), []
@@ -302,8 +295,8 @@ def attacked(
         after.append(backend.step(x[block], u[block], hidden=h[block]).x)
     r = difference(model.states, np.concatenate(after), model.step(x, u).x)
     above = (np.abs(r) > gamma).any(axis=1)
-    out: dict[str, Any] = {"points": len(x), "violations": int(above.sum()), "share": float(above.mean())}
-    out |= entry.summary()
+    counts = {"points": len(x), "violations": int(above.sum()), "share": float(above.mean())}
+    out: dict[str, Any] = counts | entry.summary()
     if above.any():
         k, i = np.unravel_index(int(np.argmax(np.abs(r) / np.maximum(gamma, np.finfo(float).tiny))), r.shape)
         witness = {"z": [*x[k].tolist(), *u[k].tolist()], "hidden": h[k].tolist(), "state": gate.states[i]}

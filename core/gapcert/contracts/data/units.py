@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import math
 import re
@@ -87,19 +86,14 @@ def known_unit(text: str) -> bool:
         return False
 
 
-_COHERENT = re.compile(r"(?:\b(?:1|m|s|kg|rad|A|K|N|J|W|V|C|Hz|Pa)\b|\*\*-?\d|\^-?\d|[*/ ()·])*")
-"""Products of symbols that SI units are multiplied of without a factor: these need no pint, whose import takes long."""
+_COHERENT = re.compile(r"(?:\b(?:1|m|s|kg|rad|A|K|N|J|W|V|C|Hz|Pa)\b|\*\*-?\d|\^-?\d|[*/ ()·])*")  # these need no pint
 
 
 @functools.lru_cache(4096)
-def base(unit: str) -> tuple[float, float]:
-    """(a, b): a number v in the unit is a v + b in SI base units; (1, 0) of a unit that is not known."""
-    if not _COHERENT.fullmatch(unit):
-        with contextlib.suppress(Exception):  # pint raises whatever its tokenizer raises
-            parsed = _registry().parse_units(unit)
-            zero, far = (float(_registry().Quantity(v, parsed).to_base_units().magnitude) for v in (0.0, 2.0**30))
-            return (far - zero) / 2.0**30, zero
-    return 1.0, 0.0
+def base(unit: str) -> float:
+    """How many SI base units it is; 1 where that is not known."""
+    plain = _COHERENT.fullmatch(unit) or not known_unit(unit)
+    return 1.0 if plain else float(_registry().Quantity(1.0, unit).to_base_units().magnitude)
 
 
 @functools.cache
