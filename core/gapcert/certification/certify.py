@@ -16,6 +16,7 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert.certification import contradiction
 from gapcert.certification.certificate import Audit, Certificate, Ledger, Record, figures, gap_digest, points_refute
 from gapcert.certification.compatibility import refuse, unpaired
 from gapcert.certification.gates import entry, hidden_state
@@ -150,7 +151,7 @@ def measure(question: Question, store: Store, gate: Gate) -> GapProblem:
     none = AffinePredictor.none(domain.nx, len(domain.low))
     pairs = entry.paired(store, gate)
     asked = LipschitzProblem(domain, none, e, query, residual.model, residual.backend, seed, pairs, rounding)
-    symmetry = Symmetry.checked(symmetries, asked) if symmetries else None
+    symmetry = contradiction.symmetric(asked, Symmetry.checked(symmetries, asked)) if symmetries else None
     held = () if symmetry is None else symmetry.axes
     sampling = sampling.holding(held)
     samples = store.samples("bound-0", sampling.first(domain), sampling.kept(domain))
@@ -158,6 +159,7 @@ def measure(question: Question, store: Store, gate: Gate) -> GapProblem:
     store.emit(Event("stage-started", "lipschitz", {}))
     asked = replace(asked, predictor=p, held=held)
     constants = watched(asked, question.lipschitz.bound(asked), samples, store.emit)
+    contradiction.constants(asked, constants)
     constants = constants if symmetry is None else symmetry.applied(constants, p, domain)
     further: Array | None
     if constants.cells is not None and question.fit.cells:
@@ -273,7 +275,7 @@ def conclude(
 ) -> Certificate:
     """Evidence and the strongest claim, of those asked for, that the evidence allows."""
     route, request, model = question.route, question.request, question.model
-    refuted = route.refuted(problem, gap)
+    refuted = route.refuted(problem, gap) or contradiction.by_audit(problem, audited.z, audited.r)
     gate = hidden_state.attacked(gate, gap, problem, model, store.emit)
     attacked = attack(gap, store.residual, problem.domain, request.attack, problem.seed, store.emit) if request.attack else {}
     if record is not None and attacked:
@@ -282,6 +284,8 @@ def conclude(
     drawn = f"uniform on {problem.domain.words}{gate.distribution}{'' if record is None else record.draws}"
     constant, envelope = route.yardsticks(gap, problem, record, audited.z)
     over = refuted is not None or points_refute(audited, attacked, gate)
+    if route.claim == "assumed" and not over:
+        contradiction.gamma(problem, gap, store.residual)
     return Certificate(
         gap,
         problem,
