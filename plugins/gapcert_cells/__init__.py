@@ -14,6 +14,7 @@ _HOME = homes(
         "gapcert_cells.hoa": "read_hoa",
         "gapcert_cells.load": "load_controller",
         "gapcert_cells.ltl": "automaton_of",
+        "gapcert_cells.outside": "inside_alone refusal",
         "gapcert_cells.successors": "Along Splits Successors SuccessorsByLevel",
     }
 )

@@ -15,6 +15,7 @@ from gapcert.plugin import ANYWHERE, Array, Automaton, Bools, Box, Controller, G
 
 from .files import loaded, write_saved
 from .grid_controller import GridController
+from .outside import inside_alone, refusal
 
 
 @final
@@ -106,7 +107,7 @@ class AutomatonController(Controller):
         x = np.atleast_2d(np.asarray(x, dtype=np.float64))
         if (lost := np.flatnonzero(~self.keeps(x, memory))).size:
             told = f"its memory is {int(memory[lost[0]])}"
-            raise self.refusal(x, int(lost[0]), told, "`keeps` before `respond`")
+            raise refusal(self, x, int(lost[0]), told, "`keeps` before `respond`")
         out = np.empty((len(x), self.parts[0].points.shape[1]))
         for q in np.unique(memory):
             rows = memory == q
@@ -118,7 +119,7 @@ class AutomatonController(Controller):
     def act(self, x: Array, policy: Policy, seed: int = 0, k: int = 0, *, outside: Outside = "raise") -> Array:
         """The inputs of runs that begin at x; later ones have a memory, and ask `respond`."""
         if outside == "nan":
-            return self.inside_alone(self.parts[0].points.shape[1], x, policy, seed, k)
+            return inside_alone(self, self.parts[0].points.shape[1], x, policy, seed, k)
         x = np.atleast_2d(np.asarray(x, dtype=np.float64))
         return self.respond(x, self.start(x), policy, seed, k)
 

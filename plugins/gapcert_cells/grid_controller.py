@@ -33,6 +33,7 @@ from gapcert.plugin import (
 )
 
 from .files import loaded, write_saved
+from .outside import inside_alone, refusal
 from .successors import Splits, Successors, SuccessorsByLevel
 
 Promised = Successors | SuccessorsByLevel
@@ -136,12 +137,12 @@ class GridController(Controller):
         """One allowed input per state, chosen as `policies` says; UsageError outside the domain, or NaN."""
         known(policy)
         if outside == "nan":
-            return self.inside_alone(self.points.shape[1], x, policy, seed, k)
+            return inside_alone(self, self.points.shape[1], x, policy, seed, k)
         x = np.atleast_2d(np.asarray(x, dtype=np.float64))
         cell = self.cells(x)
         lost = np.flatnonzero((cell < 0) | (self.values[cell] < 0))
         if lost.size:
-            raise self.refusal(x, int(lost[0]))
+            raise refusal(self, x, int(lost[0]))
         allowed = self.allowed(cell)
         number = allowed.sum(axis=1, dtype=np.int64)
         if not number.all():

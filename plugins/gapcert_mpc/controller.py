@@ -14,7 +14,7 @@ from typing import Any, Generic, Protocol, TypeVar, final
 import numpy as np
 
 from gapcert.plugin import Array, Bools, Controller, Event, Goal, Ints, Outside, Policy, Pulse, UsageError, circle
-from gapcert_cells import loaded, write_saved
+from gapcert_cells import inside_alone, loaded, refusal, write_saved
 
 from .planning.arrival import Arrival
 from .planning.design import Design
@@ -120,13 +120,13 @@ class PlanController(Controller, Generic[R]):
         out = np.empty((len(x), len(half)))
         for i, held in enumerate(self.memory.of(memory)):
             if held is None:
-                raise self.refusal(x, i, "no plan begins there")
+                raise refusal(self, x, i, "no plan begins there")
             out[i] = middle + half * self._input(self.framed(x[i])[0], held)
         return out
 
     def act(self, x: Array, policy: Policy = "first", seed: int = 0, k: int = 0, *, outside: Outside = "raise") -> Array:
         if outside == "nan":
-            return self.inside_alone(0 if self.design is None else len(self.design.frame.u[0]), x, policy, seed, k)
+            return inside_alone(self, 0 if self.design is None else len(self.design.frame.u[0]), x, policy, seed, k)
         return self.respond(x, self.start(np.atleast_2d(x)), policy, seed, k)
 
     def kept(self, x: Array, u: Array, after: Array, memory: Ints | None = None) -> Bools:

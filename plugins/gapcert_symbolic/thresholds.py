@@ -36,6 +36,7 @@ class Thresholds:
     drift_cells: int = chosen(4096, "over which it is asked whether a state can be held: a bound, whatever the cells are")
     widenings: int = chosen(4, "by 1/4, 1, 4, 16 times its width: of an input's range, to learn what would suffice")
     widening_halvings: int = chosen(5, "of the last widening: what suffices is known to 1/32 of it")
+    needed_halvings: int = threshold(16, "by the formula, what is needed at the least is then known to the three digits shown")
     factors: tuple[int, int] = chosen((2, 4), "more cells per axis, that are tried")
     # solvers
     affine_inputs: int = chosen(64, "above, tables are shared by inputs and pay")

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.random import Generator
 
 from gapcert.certification.certificate import Audit, Certificate, Record, figures, gap_digest, points_refute
+from gapcert.certification import contradiction
 from gapcert.certification.compatibility import refuse, unpaired
 from gapcert.certification.fingerprint import Fingerprint, digest
 from gapcert.certification.gates import entry, hidden_state
@@ -165,7 +166,7 @@ def measure(question: Question, store: Store, gate: Gate) -> GapProblem:
     none = AffinePredictor.none(domain.nx, len(domain.low))
     pairs = entry.paired(store, gate)
     asked = LipschitzProblem(domain, none, e, query, residual.model, residual.backend, seed, pairs, rounding)
-    symmetry = Symmetry.checked(symmetries, asked) if symmetries else None
+    symmetry = contradiction.symmetric(asked, Symmetry.checked(symmetries, asked)) if symmetries else None
     held = () if symmetry is None else symmetry.axes
     sampling = sampling.holding(held)
     samples = store.samples("bound-0", sampling.first(domain), sampling.kept(domain))
@@ -173,6 +174,7 @@ def measure(question: Question, store: Store, gate: Gate) -> GapProblem:
     store.emit(Event("stage-started", "lipschitz", {}))
     asked = replace(asked, predictor=p, held=held)
     constants = watched(asked, question.lipschitz.bound(asked), samples, store.emit)
+    contradiction.constants(asked, constants)
     constants = constants if symmetry is None else symmetry.applied(constants, p, domain)
     further: Array | None
     if constants.cells is not None and question.fit.cells:
@@ -290,7 +292,7 @@ def conclude(
 ) -> Certificate:
     """Evidence and the strongest claim, of those asked for, that the evidence allows."""
     route, request, model = question.route, question.request, question.model
-    refuted = route.refuted(problem, gap)
+    refuted = route.refuted(problem, gap) or contradiction.by_audit(problem, audited.z, audited.r)
     moved = partial(ledger.enter, question.identity, "hidden state", f"{gap_digest(gap, problem)}:{store.key}")
     gate = hidden_state.attacked(gate, gap, problem, model, moved, store.emit)
     whole, fresh = Residual(store.residual.backend, model), audited.entry.draws(problem.seed, "attack")
@@ -301,6 +303,8 @@ def conclude(
     drawn = f"uniform on {problem.domain.words}{gate.distribution}{'' if record is None else record.draws}"
     constant, envelope = route.yardsticks(gap, problem, record, audited.z)
     over = refuted is not None or points_refute(audited, attacked, gate)
+    if route.claim == "assumed" and not over:
+        contradiction.gamma(problem, gap, store.residual)
     return Certificate(
         gap,
         problem,

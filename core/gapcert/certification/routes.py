@@ -148,7 +148,8 @@ class _Bounded(_Audited):
         return _origin(problem)
 
     def refutation(self, problem: GapProblem, refuted: Refuted, states: Sequence[str]) -> str:
-        return f"REFUTED: two samples contradict the constants of {states[refuted['state']]} by {refuted['excess']:.3g}."
+        both = f": g changes by {refuted['change']:.6g}, and they allow {refuted['allowed']:.6g}" if "change" in refuted else ""
+        return f"REFUTED: two samples contradict the constants of {states[refuted['state']]} by {refuted['excess']:.3g}{both}."
 
 
 @final
@@ -242,15 +243,16 @@ def _assumptions(basis: Sequence[str], problem: GapProblem, audited: Audit, mode
 def _origin(problem: GapProblem) -> list[str]:
     """Whence the constants are, and where they jump."""
     bound, p = problem.lipschitz, problem.predictor
+    but = "" if problem.symmetry is None else problem.symmetry.exception
     what = "r" if p.kind == "none" else f"r − p (p: {p.kind} predictor)"
     from_where = {
-        "analytic": "were derived analytically",
-        "interval": "were proved by interval arithmetic from the equations of both systems",
+        "analytic": f"were derived analytically{but}",
+        "interval": f"were proved by interval arithmetic from the equations of both systems{but}",
         "declared": "were declared by the user and are taken on trust",
         "estimated": f"were estimated by {bound.method} from {bound.samples} transitions and multiplied by {bound.safety:g}; "
         f"an estimate is not a bound",
     }[bound.provenance]
-    jumps = jump_sentence(bound, problem.domain.axes)
+    jumps = jump_sentence(bound, problem.domain.axes, but)
     return [f"The per-axis Lipschitz constants of {what} {from_where}.", *filter(None, (jumps,))]
 
 

@@ -21,6 +21,10 @@ class Thresholds:
     trail_clear: float = chosen(16.0, "resolutions: smaller changes tell nothing")
     supremum_batch: int = chosen(2048, "boxes of a round: fewer go to the largest bound first, more cost less each")
     supremum_probes: int = chosen(64, "boxes of a round whose centres and corners are asked, for a lower end")
+    hunt_boxes: int = chosen(20_000, "of a search for what contradicts a declaration: seconds, where equations are long")
+    hunt_batch: int = chosen(64, "boxes of its rounds: few go deep, as a narrow spike asks")
+    hunt_width: float = chosen(1e-12, "of an axis: what is narrower drowns in rounding")
+    hunt_steps: int = chosen(40, "halvings of an axis, by which a suspected point is left")
     # gates
     hidden_vertices: int = chosen(64, "of declared ranges, at most: beyond six numbers they are drawn")
     hidden_move: float = chosen(0.1, "of a hidden number without a range, in rad, m, rad/s, …; 1 where it has no unit")

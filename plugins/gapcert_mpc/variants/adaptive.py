@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 
 from gapcert.plugin import Array, Bools, Controller, Goal, Interval, Ints, Outside, Policy, SynthesisProblem
-from gapcert_cells import loaded, write_saved
+from gapcert_cells import inside_alone, loaded, write_saved
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.planning.plans import Memory
 from gapcert_mpc.program.linearise import Nominal
@@ -188,7 +188,7 @@ class AdaptiveMpcController(Controller):
 
     def act(self, x: Array, policy: Policy = "first", seed: int = 0, k: int = 0, *, outside: Outside = "raise") -> Array:
         if outside == "nan":
-            return self.inside_alone(self.levels.family.problem.model.nu, x, policy, seed, k)
+            return inside_alone(self, self.levels.family.problem.model.nu, x, policy, seed, k)
         return self.respond(x, self.start(x), policy, seed, k)
 
     def kept(self, x: Array, u: Array, after: Array, memory: Ints | None = None) -> Bools:

@@ -14,7 +14,7 @@ import numpy as np
 
 from gapcert import Array, Context, Controller, Domain, Goal, Model, SynthesisProblem, UsageError, load_controller, registry
 from gapcert.plugin import Bools, Ints, Outside, Policy, Synthesizer, of_config
-from gapcert_cells import GridController, loaded, write_saved
+from gapcert_cells import GridController, inside_alone, loaded, write_saved
 from gapcert_mpc.config import Terminal
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.planning.design import Design, Ends
@@ -278,7 +278,7 @@ class HandedController(Controller):
 
     def act(self, x: Array, policy: Policy = "first", seed: int = 0, k: int = 0, *, outside: Outside = "raise") -> Array:
         if outside == "nan":
-            return self.inside_alone(len(self.design.frame.u[0]), x, policy, seed, k)
+            return inside_alone(self, len(self.design.frame.u[0]), x, policy, seed, k)
         return self.respond(x, self.start(x), policy, seed, k)
 
     def kept(self, x: Array, u: Array, after: Array, memory: Ints | None = None) -> Bools:

@@ -81,11 +81,14 @@ def drift(problem: SynthesisProblem, grid: Grid, inputs: Box) -> Drift | None:
                 found = ranges(used)
                 return bool(found.lo[:, j].min() <= 0 <= found.hi[:, j].max())
 
-            return Drift(grid.box.axes[k], float(low[j]), float(high[j]), sufficient(held, inputs))
+            needed = sufficient(held, inputs, halvings=THRESHOLDS.needed_halvings)
+            return Drift(grid.box.axes[k], float(low[j]), float(high[j]), needed)
     return None
 
 
-def sufficient(enough: Callable[[Box], bool], inputs: Box, wider: Box | None = None) -> Box | None:
+def sufficient(
+    enough: Callable[[Box], bool], inputs: Box, wider: Box | None = None, halvings: int = THRESHOLDS.widening_halvings
+) -> Box | None:
     """Ranges that are `enough`, the inputs' own widened at both ends or, where that is so, at one alone; None if none is found.
 
     They are widened by their width times 1/4, 1, 4, …, or by what `wider` adds, and from there bisected.
@@ -103,7 +106,7 @@ def sufficient(enough: Callable[[Box], bool], inputs: Box, wider: Box | None = N
     if (most := next((s for s in scales if enough(box(s))), None)) is None:
         return None
     least = most / 4 if most > 1 else 0.0
-    for _ in range(THRESHOLDS.widening_halvings):
+    for _ in range(halvings):
         middle = (least + most) / 2
         least, most = (least, middle) if enough(box(middle)) else (middle, most)
     for end, j in np.argwhere(added > 0) if np.count_nonzero(added) > 1 else ():

@@ -114,7 +114,7 @@ def _too_weak(moved: Drift, inputs: Box) -> Cause:
     own, wider = ranges(inputs, needed), ranges(needed, inputs)
     return Cause(
         f"{a.name}: the inputs are too weak: with {own} each step {by}, so the goal cannot be kept, by cells of any size; "
-        f"at the least {wider} is needed",
+        f"about {wider} is needed at the least",
         of="inputs",
         needed=needed,
     )

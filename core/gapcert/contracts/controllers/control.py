@@ -18,7 +18,6 @@ from gapcert.contracts.plugins.events import Emit, silent
 from gapcert.contracts.systems.domain import Domain, Outside, turned
 from gapcert.contracts.systems.system import Model
 from gapcert.numerics.arrays import Array, Bools, Ints
-from gapcert.numerics.errors import UsageError
 
 
 @final
@@ -102,28 +101,7 @@ class Controller(ABC):
 
     @abstractmethod
     def act(self, x: Array, policy: Policy, seed: int = 0, k: int = 0, *, outside: Outside = "raise") -> Array:
-        """Inputs (n, nu) for states (n, nx) at step k; outside the domain (never another cell's input) `refusal`, or a row of
-        NaN, as `inside_alone` has it.
-        """
-
-    @final
-    def inside_alone(self, nu: int, x: Array, policy: Policy, seed: int, k: int) -> Array:
-        """`act` with NaN in rows outside the domain: there another row is asked in place, so that a random choice stays that of
-        its row.
-        """
-        x = np.atleast_2d(np.asarray(x, dtype=np.float64))
-        out, inside = np.full((len(x), nu), np.nan), self.contains(x)
-        if inside.any():
-            out[inside] = self.act(np.where(inside[:, None], x, x[np.argmax(inside)]), policy, seed, k)[inside]
-        return out
-
-    @final
-    def refusal(self, x: Array, row: int, why: str = "", ask: str = "`contains` before `act`") -> UsageError:
-        """For the state x[row] outside the domain: its axes and values, and the one that leaves `goal.stay`, if one does."""
-        at, stay = np.atleast_2d(np.asarray(x, dtype=np.float64))[row : row + 1], self.goal.stay
-        state = ", ".join(f"{a.name} = {v!r}" for a, v in zip(stay.axes, at[0].tolist(), strict=True))
-        told = "; ".join(filter(None, (why, stay.leaves(turned(stay, at)[0]))))
-        return UsageError(f"controller: row {row}: {state} is outside its domain; ask {ask}" + (f" ({told})" if told else ""))
+        """Inputs (n, nu) for states (n, nx) at step k; outside the domain (never another cell's input) UsageError, or NaN."""
 
     def start(self, x: Array) -> Ints:
         """Memory (n,) of runs that begin at x; 0 where nothing need be remembered."""
