@@ -62,6 +62,7 @@ _HOME = homes(
         "gapcert.numerics.order_statistics": "missed",
         "gapcert.numerics.texts": "columns leaves times",
         "gapcert.cli.listing": "entry",
+        "gapcert.cli.terminal": "Terminal",
         "gapcert.run.build": "Build",
         "gapcert.run.folder": "stored",
         "gapcert.run.progress_rate": "figure",

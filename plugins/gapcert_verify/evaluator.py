@@ -67,7 +67,15 @@ FUNCTIONS: dict[str, tuple[Callable[[Range], Range], Callable[[Range, Range], Ra
     "round": (ar.rounded, lambda x, y: _jump(x, _UP)),
 }
 """Name → range, and range of the slope from those of argument and value; beside them a text may call min and max."""
-_BINARY = {"+": ar.add, "-": ar.subtract, "*": ar.multiply, "/": ar.divide, "min": ar.least, "max": ar.greatest, "soft": ar.soft}
+_BINARY = {
+    "+": ar.add,
+    "-": ar.subtract,
+    "*": ar.multiply,
+    "/": ar.divide,
+    "min": ar.least,
+    "max": ar.greatest,
+    "soft": ar.soft,
+}
 
 
 @final
@@ -529,7 +537,9 @@ class _Step:
         new = {i: x[i] + h * r for i, r in zip(rows, rates, strict=True)}
         for k, q in enumerate(sites):
             if (bound := (self.section.get("dry_friction") or {}).get(q)) is not None:
-                if mass is not None and any(not e.is_number(0) for i, row in enumerate(mass) for e in (*row[:i], *row[i + 1 :])):
+                if mass is not None and any(
+                    not e.is_number(0) for i, row in enumerate(mass) for e in (*row[:i], *row[i + 1 :])
+                ):
                     raise NotText("dry friction at coordinates that the mass matrix couples")
                 limit = self.tape.put("max", self._read(x, bound), self.tape.number(0))
                 push = h * limit if mass is None else h * limit / mass[k][k]
