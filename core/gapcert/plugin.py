@@ -65,6 +65,7 @@ _HOME = homes(
         "gapcert.numerics.majorant": "cells_of majorant majorant_of",
         "gapcert.numerics.order_statistics": "missed",
         "gapcert.numerics.texts": "columns leaves times",
+        "gapcert.cli.terminal": "Terminal",
         "gapcert.run.build": "Build",
         "gapcert.run.folder": "LOCK MARK is_run owned stored",
         "gapcert.run.progress_rate": "duration figure",

@@ -13,8 +13,7 @@ import numpy as np
 
 from gapcert import Array, Box, Domain, GapFunction, Goal, MissingDependency, Model, Region, SynthesisProblem, UsageError
 from gapcert.plugin import Bools, Ints, Policy, Pulse, Synthesizer, magnitude
-from gapcert_cells import AutomatonController, GridController, Successors
-from gapcert_symbolic.thresholds import THRESHOLDS
+from gapcert_cells import GROWTH, SEEN, AutomatonController, GridController, Successors
 
 from .cells.abstraction import Windows, check_size, windows
 from .cells.bounds import Bound, Enclosed, Grown, inferred
@@ -28,11 +27,6 @@ from .games.refinement import Refined, refined
 from .solvers.problem import Dynamics, Problem, Solution
 
 CHUNK = 1 << 20
-TRUSTED = "The successors of cells are bounded by the growth bound that is declared, in floating point; nothing proves it."
-SEEN = (
-    f"On which states and inputs the model's successors depend was inferred from {THRESHOLDS.structure_pairs} random pairs of "
-    "points per axis, as the model encloses no derivatives; a dependence that none of them shows is missed."
-)
 
 
 @final
@@ -164,7 +158,7 @@ class Symbolic(Synthesizer):
         if plan.held is not None:
             evidence["held"] = {n: [a, b] for n, a, b in zip(plan.held.names, plan.held.low, plan.held.high, strict=True)}
         if self.growth is not None:
-            evidence["assumptions"] = [TRUSTED, *([SEEN] if inferred(problem.model, grid, axes) else [])]
+            evidence["assumptions"] = [GROWTH, *([SEEN] if inferred(problem.model, grid, axes) else [])]
         if not found.won(1 if made.beyond else 0):
             evidence |= self._reason(problem, plan, added, made)
         points, solution, labels = combined(axes), found.solution, found.labels

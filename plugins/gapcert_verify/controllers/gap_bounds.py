@@ -57,9 +57,9 @@ class Gap:
     def slopes(self) -> Array | None:
         """(nx, nz): by how much the ends may move per unit of each coordinate; None where that is not known from constants."""
         e = self.evidence
-        form, kind = e.data["form"]["form"], e.data["predictor"]
+        form, kind, nz = e.data["form"]["form"], e.data.get("predictor", "none"), len(e.zone.low)
         if form == "constant":
-            return np.zeros((len(e.arrays["resolution"]), len(e.zone.low)))
+            return np.zeros((len(e.arrays["gap.gamma"]), nz))
         if form != "envelope" or kind not in ("none", "affine"):
             return None
         constants = e.arrays["cells.L"].max(axis=0) if "cells.L" in e.arrays else e.arrays["lipschitz"]

@@ -15,7 +15,7 @@ from gapcert_verify.arithmetic import Range
 
 from .cells import Cells, Heights, Level
 from .games import NONE, Part
-from .successors import Flow, Windows
+from .successors import Flow, Stored, Windows
 
 PAIRS = 1 << 19  # of a cell and an input, at once
 BATCH = 1 << 12  # pairs that are looked at part by part together
@@ -27,48 +27,51 @@ CORNER = 0.999  # of the way from the middle of a cell to a corner, where a step
 @final
 @dataclass(frozen=True)
 class Proof:
-    """cells, their parts to be proved, the flow and, in (x, u), the domain that its gap is known in.
+    """cells, their parts to be proved, and, in (x, u), the domain that the gap is known in. flow: None takes the successors that
+    the controller has stored.
 
     tick: told how many of how many cells are done; begin: so many need not be looked at again.
     """
 
     cells: Cells
     parts: Sequence[Part]
-    flow: Flow
+    flow: Flow | None
     zone: Zone
     tick: Callable[[int, int], None] = field(default=lambda done, total: None)
     begin: int = 0
 
     def run(self) -> str:
         """ "" where all is proved, else the first pair that is not, and a step that refutes it where one was found."""
-        total, done, step = self.cells.size, 0, max(1, PAIRS // len(self.flow.points))
+        total, done, step = self.cells.size, 0, max(1, PAIRS // len(self.points))
         heights = [self.cells.heights(p.height) for p in self.parts]
         for at, level in enumerate(self.cells.levels):
-            windows: Windows | None = None
+            windows: Windows | Stored | None = None
             for a in range(0, len(level.node), step):
                 rows = np.arange(a, min(a + step, len(level.node)))
                 done += len(rows)
                 if done <= self.begin:
                     continue
-                windows = windows or Windows(self.flow, level)
+                windows = windows or (Stored(self.cells, level) if self.flow is None else Windows(self.flow, level))
                 if text := self._rows(windows, [h[at] for h in heights], rows):
                     return text
                 self.tick(done, total)
         return ""
 
-    def _rows(self, windows: Windows, heights: Sequence[Heights], rows: Ints) -> str:
+    @property
+    def points(self) -> Array:
+        return self.cells.controller.points
+
+    def _rows(self, windows: Windows | Stored, heights: Sequence[Heights], rows: Ints) -> str:
         level = windows.level
         for part, height in zip(self.parts, heights, strict=True):
-            limit = part.limit[level.node[rows]]
-            own = rows[limit != NONE]
+            own = rows[part.limit[level.node[rows]] != NONE]
             if not len(own):
                 continue
-            allowed = np.unpackbits(part.bits[level.node[own]], axis=1, count=len(self.flow.points))
+            allowed = np.unpackbits(part.bits[level.node[own]], axis=1, count=len(self.points))
             pairs = np.nonzero(allowed)
             if text := self._outside(level, own, pairs):
                 return text
-            first, last = windows.of(own, pairs)
-            left = np.flatnonzero(height.over(first, last) > part.limit[level.node[own[pairs[0]]]])
+            left = np.flatnonzero(height.over(*windows.of(own, pairs)) > part.limit[level.node[own[pairs[0]]]])
             for k in range(0, len(left), BATCH):
                 some = left[k : k + BATCH]
                 if text := self._settled(level, height, part, own[pairs[0][some]], pairs[1][some]):
@@ -80,10 +83,10 @@ class Proof:
         zone, nx = self.zone, len(level.axes)
         low, high = level.boxes(rows)
         for a, bound, relation in zip(zone.matrix, zone.bounds, zone.relations, strict=True):
-            ends = np.maximum(a[:nx] * low, a[:nx] * high).sum(axis=1)[pairs[0]] + (self.flow.points @ a[nx:])[pairs[1]]
+            ends = np.maximum(a[:nx] * low, a[:nx] * high).sum(axis=1)[pairs[0]] + (self.points @ a[nx:])[pairs[1]]
             size = (
                 np.abs(a[:nx] * np.maximum(np.abs(low), np.abs(high))).sum(axis=1).max()
-                + np.abs(self.flow.points * a[nx:]).sum(axis=1).max()
+                + np.abs(self.points * a[nx:]).sum(axis=1).max()
             )
             # Sums of products err by less than so many ulp of their size, and so may bounds that were moved.
             if (over := ends > bound + 1e-13 * (size + abs(bound))).any():
@@ -93,15 +96,17 @@ class Proof:
 
     def _settled(self, level: Level, height: Heights, part: Part, rows: Ints, which: Ints) -> str:
         """The parts of cells that may go wrong, halved until they go right."""
-        limit = part.limit[level.node[rows]].astype(np.int64)
-        if (bad := self._refuted(level, height, rows, which, limit)) is not None:
+        if self.flow is None:
+            return f"{self._named(level, rows[0], which[0])}{part.memory}: what it has stored of it leads where it must not"
+        limit, flow = part.limit[level.node[rows]].astype(np.int64), self.flow
+        if (bad := self._refuted(flow, level, height, rows, which, limit)) is not None:
             row, x, after = bad
             told = f"at {x.tolist()} it leads to {after.tolist()}, where the promise does not hold"
             return f"{self._named(level, rows[row], which[row])}{part.memory}: {told}"
         pair, (low, high) = np.arange(len(rows)), level.boxes(rows)
-        weight = self._weights(level)
+        weight = self._weights(flow, level)
         for _ in range(DEEP * len(level.axes)):
-            wrong = ~self._right(level, height, low, high, which[pair], limit[pair])
+            wrong = ~self._right(flow, level, height, low, high, which[pair], limit[pair])
             if not wrong.any():
                 return ""
             pair, low, high = pair[wrong], low[wrong], high[wrong]
@@ -115,35 +120,37 @@ class Proof:
         first = int(pair[0])
         return f"{self._named(level, rows[first], which[first])}{part.memory}: it was not proved where it leads"
 
-    def _weights(self, level: Level) -> Array:
+    def _weights(self, flow: Flow, level: Level) -> Array:
         """(axes,): how many cells the successors move by per unit of each coordinate."""
         low, high = (np.array([[a.edges[end] for a in level.axes]]) for end in (0, -1))
-        u = self.flow.points[:1]
+        u = self.points[:1]
         columns = [
             Range(np.concatenate([low, u], axis=1)[:, j], np.concatenate([high, u], axis=1)[:, j])
             for j in range(len(level.axes) + u.shape[1])
         ]
         wide, nx = frozenset(range(len(level.axes))), len(level.axes)
-        _, slopes = self.flow.model.tape.run(columns, self.flow.model.terms, wide)
+        _, slopes = flow.model.tape.run(columns, flow.model.terms, wide)
         size, widths = np.zeros((nx, nx)), np.array([a.width for a in level.axes])
         for k, own in enumerate(slopes):
             for j, s in own.items():
                 size[k, j] = float(np.nan_to_num(s.mag, nan=1e6, posinf=1e6).max())
-        if self.flow.gap is not None and (more := self.flow.gap.slopes) is not None:
+        if flow.gap is not None and (more := flow.gap.slopes) is not None:
             size += more[:, :nx]
         out = (size / widths[:, None]).max(axis=0)
         return np.asarray(np.maximum(out, 1e-9 / widths))
 
-    def _right(self, level: Level, height: Heights, low: Array, high: Array, which: Ints, limit: Ints) -> Bools:
+    def _right(self, flow: Flow, level: Level, height: Heights, low: Array, high: Array, which: Ints, limit: Ints) -> Bools:
         out = np.empty(len(low), dtype=bool)
         for a in range(0, len(low), 1 << 14):
             s = slice(a, a + (1 << 14))
-            ends = [axis.touched(x) for axis, x in zip(level.axes, self.flow.over(low[s], high[s], which[s]), strict=True)]
+            ends = [axis.touched(x) for axis, x in zip(level.axes, flow.over(low[s], high[s], which[s]), strict=True)]
             first, last = (np.stack(end, axis=1) for end in zip(*ends, strict=True))
             out[s] = height.over(first, last) <= limit[s]
         return out
 
-    def _refuted(self, level: Level, height: Heights, rows: Ints, which: Ints, limit: Ints) -> tuple[int, Array, Array] | None:
+    def _refuted(
+        self, flow: Flow, level: Level, height: Heights, rows: Ints, which: Ints, limit: Ints
+    ) -> tuple[int, Array, Array] | None:
         """(pair, x, after): a state of a cell, and one that a step certainly may lead to and must not."""
         low, high = level.boxes(rows)
         sides = np.stack(np.meshgrid(*[[0.0, -1.0, 1.0]] * len(level.axes), indexing="ij"), axis=-1).reshape(
@@ -151,7 +158,7 @@ class Proof:
         )
         for side in sides[np.argsort(np.abs(sides).sum(axis=1) % len(level.axes), kind="stable")][:33]:
             x = low / 2 + high / 2 + side * CORNER * (high - low) / 2
-            for after in self.flow.certain(x, which):
+            for after in flow.certain(x, which):
                 ends = [axis.touched(r) for axis, r in zip(level.axes, after, strict=True)]
                 # Rounding leaves open which of two cells it is: it is the lowest.
                 corners = (np.stack(corner, axis=1) for corner in itertools.product(*ends))
@@ -164,4 +171,4 @@ class Proof:
     def _named(self, level: Level, row: int, which: int) -> str:
         low, high = level.boxes(np.array([row]))
         box = ", ".join(f"[{a:.6g}, {b:.6g}]" for a, b in zip(low[0], high[0], strict=True))
-        return f"cell {int(level.node[row])} ({box}) under {self.flow.points[which].tolist()}"
+        return f"cell {int(level.node[row])} ({box}) under {self.points[which].tolist()}"

@@ -16,7 +16,7 @@ from gapcert_verify import arithmetic as ar
 from gapcert_verify.arithmetic import Range
 from gapcert_verify.evaluator import Equations, Term
 
-from .cells import Level
+from .cells import Cells, Level
 from .gap_bounds import Gap
 
 ENTRIES = 1 << 22  # of a table that is kept
@@ -248,3 +248,29 @@ class _Part:
             half = np.repeat(level.half[None], m, axis=0)
             x = _wider(x, np.tile(flow.growth.over(half, flow.points[self.columns], self.k), n))
         return Range(x.lo.reshape(n, m)[row], x.hi.reshape(n, m)[row])
+
+
+@final
+@dataclass(frozen=True)
+class Stored:
+    """The successors that a controller has stored, of the nodes of a level; a state without cells stays in its box."""
+
+    cells: Cells
+    level: Level
+
+    def of(self, rows: Ints, pairs: tuple[Ints, Ints]) -> tuple[Ints, Ints]:
+        """As `Windows.of`."""
+        c = self.cells.controller
+        found = c.successors
+        assert found is not None, "asked of what has them"
+        ends = found.ends(self.level.node[rows[pairs[0]]], pairs[1])
+        shift = 0 if c.splits is None else c.splits.levels - self.cells.levels.index(self.level)
+        first, last = np.zeros((2, len(pairs[0]), len(self.level.axes)), dtype=np.int64)
+        for k, j in enumerate(c.on):
+            axis = self.level.axes[j]
+            first[:, j], last[:, j] = ends[0][:, k] >> shift, ends[1][:, k] >> shift
+            if axis.wraps:
+                size = np.minimum(last[:, j] - first[:, j], axis.count - 1)
+                first[:, j] %= axis.count
+                last[:, j] = first[:, j] + size
+        return first, last

@@ -1,0 +1,375 @@
+"""The controller in a run's folder: what it is, what its spec asks of it, and whether its promise can be proved once more."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast, final
+
+import numpy as np
+
+from gapcert.plugin import (
+    DAMAGE,
+    Array,
+    Box,
+    Emit,
+    GapcertError,
+    Pulse,
+    Relation,
+    Zone,
+    __version__,
+    load_spec,
+    magnitude,
+    write_atomic,
+)
+from gapcert_cells import GROWTH, SEEN, AutomatonController, GridController, saved_data
+from gapcert_verify.evaluator import Equations, NotText
+from gapcert_verify.evidence import Evidence
+
+from .cells import Cells
+from .games import figures, parts
+from .gap_bounds import Gap, coordinates
+from .grid_proof import Proof
+from .successors import Flow, Growth
+
+Check = tuple[str, Callable[[Evidence], str | None]]
+
+
+@final
+@dataclass(frozen=True)
+class Saved:
+    """A saved controller beside the certificate and the spec of its run; emit takes the progress of a long proof."""
+
+    evidence: Evidence
+    folder: Path
+    data: Mapping[str, Any]
+    emit: Emit
+
+    @property
+    def checks(self) -> list[Check]:
+        """What is checked of it, in order."""
+        found: list[Check] = [("the controller is of this certificate", lambda e: self._certified())]
+        if self.on_cells:
+            found += [
+                ("goal, cells and inputs of the controller are those of the spec", lambda e: self._asked()),
+                ("every input that the controller allows keeps its promise", lambda e: self._proved()),
+            ]
+        return found
+
+    @property
+    def trusted(self) -> list[str]:
+        """What its promise rests on beside the checks, by name."""
+        kind = self.data.get("kind")
+        if not self.on_cells:
+            return [f"The controller is of kind '{kind}', and its promise was not proved again."]
+        said = "How many rounds its games took, on which levels, over what its gap was bounded, and why nothing wins"
+        out = [
+            f"{said}, are as the controller states.",
+            "The controller without γ promises nothing of f̂: it was not looked at.",
+        ]
+        if isinstance(self._flow, str):
+            what = "was not proved again" if self.controller.successors is None else "is proved from the cells that are stored"
+            out.append(f"The controller's promise {what}: {self._flow} was not bounded.")
+        elif self._flow.growth is not None:
+            given = self._section["growth"]["model"]
+            told = "; ".join(f"{n}: {t}" for n, t in self._growth_section.get("next", {}).items()) or "integrated"
+            out.append(f"Successors of cells spread as the growth bound {given} declares ({told}).")
+        if isinstance(self._spec, str):
+            out.append(
+                f"The goal, the cells and the inputs are those that were asked for: the spec cannot be read ({self._spec})."
+            )
+        return out
+
+    @cached_property
+    def on_cells(self) -> bool:
+        """Is it one of those that `gapcert_cells` saves, whoever made it?"""
+        with suppress(*DAMAGE), np.load(self.folder / "controller.npz", allow_pickle=False) as arrays:
+            return "bits" in arrays.files
+        return False
+
+    @cached_property
+    def loaded(self) -> GridController | AutomatonController:
+        """Its digest is checked while it is read."""
+        return (AutomatonController if "automaton" in self.data["goal"] else GridController).load(self.folder)
+
+    @property
+    def controller(self) -> GridController:
+        """Its cells, and what is promised of them."""
+        return self.loaded.parts[0] if isinstance(self.loaded, AutomatonController) else self.loaded
+
+    @cached_property
+    def stored(self) -> dict[str, Any]:
+        """The run's spec as it is stored; empty where there is none."""
+        with suppress(OSError, ValueError):
+            found = json.loads((self.evidence.folder / "spec.json").read_text(encoding="utf-8"))
+            return found if isinstance(found, dict) else {}
+        return {}
+
+    @cached_property
+    def home(self) -> Path:
+        """Where the spec's paths start."""
+        with suppress(OSError, ValueError):
+            return Path(json.loads((self.evidence.folder / "run.json").read_text(encoding="utf-8"))["folder"])
+        return Path()
+
+    @property
+    def _section(self) -> Mapping[str, Any]:
+        return cast("Mapping[str, Any]", self.stored.get("controller") or {})
+
+    @cached_property
+    def _spec(self) -> Any:
+        """The parts of the spec that the controller is made from, checked; or why not."""
+        if not self._section:
+            return "there is none"
+        kept = ("version", "name", "model", "domain", "relations", "controller")
+        asked = {k: self.stored[k] for k in kept if k in self.stored}
+        states = [str(a[0]) for a in self.data["goal"]["axes"]]
+        try:
+            return load_spec({**asked, "gap": {"kind": "declared", "gamma": dict.fromkeys(states, 0.0)}}, folder=self.home)
+        except (GapcertError, *DAMAGE):
+            try:
+                return load_spec(self.stored, folder=self.home)
+            except (GapcertError, *DAMAGE) as error:
+                return str(error).splitlines()[0]
+
+    @cached_property
+    def _model(self) -> Equations | str:
+        """The equations of the run; or why not."""
+        section, names = self.stored.get("model"), [a[0] for a in self.data["goal"]["axes"]]
+        if not isinstance(section, dict):
+            return "its model, which no spec beside it states,"
+        try:
+            made = Equations.of(section)
+            added = [n for n in names if n not in made.states]
+            return Equations.of(section, added) if added else made
+        except NotText as error:
+            return str(error)
+
+    @cached_property
+    def _growth_section(self) -> Mapping[str, Any]:
+        return cast("Mapping[str, Any]", load_spec(self.home / self._section["growth"]["model"]).data["model"])
+
+    @cached_property
+    def _flow(self) -> Flow | str:
+        model, points = self._model, np.asarray(self.controller.points, dtype=np.float64)
+        if isinstance(model, str):
+            return model
+        growth: Growth | None = None
+        try:
+            if self._section.get("growth"):
+                error = np.zeros(model.nx)
+                for name, value in (self._section.get("error") or {}).items():
+                    j = model.states.index(name)
+                    error[j] = magnitude(value, self.controller.goal.stay.axes[j].unit)
+                growth = Growth(Equations.of(self._growth_section), error)
+            extended = self._extended()
+        except NotText as error_:
+            return str(error_)
+        relative = coordinates(self.stored["model"], self.stored.get("coordinates"))
+        return Flow(model, Gap(self.evidence, relative, extended, model), growth, points)
+
+    def _extended(self) -> Equations | None:
+        """The model that the certificate's predictor is the step of, less that of the run's model."""
+        if self.evidence.data["predictor"] != "model":
+            return None
+        return Equations.of(load_spec(self.home / self.stored["gap"]["predictor"]["model"]).data["model"])
+
+    def _certified(self) -> str:
+        """It names this certificate as the one behind its promise."""
+        named = self.data["evidence"].get("certificate")
+        own = hashlib.sha256((self.evidence.folder / "certificate.json").read_bytes()).hexdigest()
+        if named == own:
+            return ""
+        found = f"rests on certificate {named[:16]}…" if named else "names no certificate"
+        return f"the saved controller {found}, and this one is {own[:16]}…; run the spec again"
+
+    def _asked(self) -> str | None:
+        """Goal, cells and inputs are those of the spec, the names and the box of states those of the certificate."""
+        c, e = self.controller, self.evidence
+        goal, nx = c.goal, e.data["domain"]["states"]
+        axes = e.data["domain"]["axes"]
+        if list(goal.stay.names) != axes[:nx]:
+            return f"its states are {', '.join(goal.stay.names)}, and the certificate's {', '.join(map(str, axes[:nx]))}"
+        model = self._model
+        if isinstance(model, Equations):
+            if list(goal.stay.names) != list(model.states) or [a.kind == "angle" for a in goal.stay.axes] != list(model.angles):
+                return f"its states are {list(goal.stay.axes)}, and the model's {', '.join(model.states)}"
+            if not self.stored.get("coordinates") and list(model.inputs) != axes[nx:]:
+                return (
+                    f"the model's inputs are {', '.join(model.inputs)}, and the certificate's {', '.join(map(str, axes[nx:]))}"
+                )
+        if any(
+            a < low or b > high for a, b, low, high in zip(goal.stay.low, goal.stay.high, e.zone.low, e.zone.high, strict=False)
+        ):
+            return "its goal reaches beyond the domain of the certificate"
+        if text := self._evidence():
+            return text
+        return None if isinstance(self._spec, str) else self._of_spec()
+
+    def _evidence(self) -> str:
+        """What `evidence` says of cells is so, and what it rests on is named."""
+        c, said = self.controller, self.data["evidence"]
+        found: dict[str, Any] = {**figures(Cells.of(c), self.loaded), "inputs": len(c.points)}
+        if self.loaded.goal.automaton is not None:
+            found["automaton_states"] = len(self.loaded.goal.automaton.after)
+        if c.held is not None:
+            found["held"] = c.held.bounds
+        for name, value in found.items():
+            if said.get(name) != value and not (isinstance(value, float) and abs(said.get(name, 2.0) - value) < 1e-12):
+                return f"{name} is {value}, and stated as {said.get(name)}"
+        allowed = ([GROWTH], [GROWTH, SEEN]) if self._section.get("growth") else ([],)
+        if self._section.get("kind") == "symbolic" and said.get("assumptions", []) not in allowed:
+            return f"it rests on {allowed[0] or 'no assumption'}, and states {said.get('assumptions')}"
+        return ""
+
+    def _of_spec(self) -> str:
+        c, spec = self.controller, self._spec
+        box = Box(
+            c.goal.stay.axes, self.evidence.zone.low[: len(c.goal.stay.axes)], self.evidence.zone.high[: len(c.goal.stay.axes)]
+        )
+        if spec.goal(cast("Any", SimpleNamespace(states=box))) != self.loaded.goal:
+            return "its goal is not that of the spec"
+        if spec.config.controller.kind != self.data.get("kind"):
+            return f"it is said to be made by '{self.data.get('kind')}', and the spec asks for '{spec.config.controller.kind}'"
+        return self._gridded(spec) if spec.config.controller.kind == "symbolic" else ""
+
+    def _gridded(self, spec: Any) -> str:
+        """Edges and inputs are those that the options of `symbolic` give."""
+        given, c = self._section, self.controller
+        names, inputs = c.goal.stay.names, list(self.stored["model"].get("inputs", {}))
+        units = {n: a if isinstance(a, str) else a.get("unit", "1") for n, a in self.stored["model"].get("inputs", {}).items()}
+        ranges = {n: spec.config.domain[n] for n in inputs} | {
+            n: tuple(magnitude(v, units[n]) for v in ends) for n, ends in (given.get("input_range") or {}).items()
+        }
+        wanted = given.get("on") or list(names)
+        if sorted(wanted) != sorted(names[j] for j in c.on):
+            return f"it has cells for {', '.join(names[j] for j in c.on)}, and the spec asks for {', '.join(wanted)}"
+        if given.get("align") == "scots":
+            eta = {
+                n: magnitude(v, dict(zip(names, (a.unit for a in c.goal.stay.axes), strict=True)).get(n, units.get(n, "1")))
+                for n, v in given["eta"].items()
+            }
+            return self._scots(eta, ranges)
+        halvings = 0 if c.splits is None else c.splits.levels
+        if halvings > given.get("refine", 0):
+            return f"its cells are halved {halvings} times, and the spec asks for {given.get('refine', 0)}"
+        for j, edges in zip(c.on, c.edges, strict=True):
+            own = np.linspace(c.goal.stay.low[j], c.goal.stay.high[j], (int(given["cells"][names[j]]) << halvings) + 1)
+            if not np.array_equal(own, edges):
+                return f"the cells of {names[j]} are not the {given['cells'][names[j]]} that tile the goal's box"
+        values = [np.linspace(*ranges[n], int(given["inputs"][n])) for n in inputs]
+        return self._offered(list(product(*values)), 1e-12 * np.array([b - a for a, b in ranges.values()]))
+
+    def _offered(self, points: Any, spare: Array) -> str:
+        wanted, found = np.array(points), self.controller.points
+        same = wanted.shape == found.shape and (np.abs(wanted - found) <= spare).all()
+        return "" if same else f"its {len(found)} inputs are not the {len(wanted)} of the spec"
+
+    def _scots(self, eta: Mapping[str, float], ranges: Mapping[str, tuple[float, ...]]) -> str:
+        c, names = self.controller, self.controller.goal.stay.names
+        for name, edges in zip(names, c.edges, strict=True):
+            at = (edges[:-1] + edges[1:]) / 2 / eta[name]
+            if np.abs(at - np.round(at)).max() > 1e-6 or np.abs(np.diff(edges) / eta[name] - 1).max() > 1e-6:
+                return f"the cells of {name} do not lie at multiples of {eta[name]:g}"
+        values = []
+        for name, (low, high) in ranges.items():
+            first, last = np.ceil(low / eta[name] - 1e-6), np.floor(high / eta[name] + 1e-6)
+            values.append(eta[name] * np.arange(first, last + 1))
+        return self._offered(list(product(*values)), 1e-9 * np.array([eta[n] for n in ranges]))
+
+    def _proved(self) -> str | None:
+        flow, c = self._flow, self.controller
+        if isinstance(flow, str):
+            return None if c.successors is None else self._run(None)
+        zone = self.evidence.zone
+        u = np.asarray(c.points)
+        nx = len(c.goal.stay.axes)
+        if flow.gap is None or flow.gap.relative is None:
+            if not ((u >= zone.low[nx:]) & (u <= zone.high[nx:])).all():
+                return f"inputs between {u.min(axis=0).tolist()} and {u.max(axis=0).tolist()} reach beyond the certificate's domain"
+        return self._run(flow)
+
+    @property
+    def _zone(self) -> Zone:
+        """The certificate's domain over (x, u): relations of what is measured relative to the states are written out."""
+        zone, flow = self.evidence.zone, self._flow
+        relative = flow.gap.relative if isinstance(flow, Flow) and flow.gap is not None else None
+        if relative is None:
+            return zone
+        c, d, nx = np.asarray(relative.slope), np.asarray(relative.scale), len(relative.slope[0])
+        moved = [
+            Relation(r.text, tuple((np.concatenate([a[:nx] + a[nx:] @ c, a[nx:] * d])).tolist()), r.bound)
+            for r, a in zip(zone.relations, zone.matrix, strict=True)
+        ]
+        return Zone(zone.low, zone.high, tuple(moved))
+
+    def _run(self, flow: Flow | None) -> str:
+        cells = Cells.of(self.controller)
+        found = parts(cells, self.loaded)
+        if isinstance(found, str):
+            return found
+        kept, pulse = _Kept.of(self), Pulse(self.emit, "controller", cells.size, "cells", "proof")
+
+        def tick(done: int, total: int) -> None:
+            pulse(done)
+            kept.done(done, total)
+
+        return Proof(cells, found, flow, self._zone, tick, kept.begin).run()
+
+
+def controlled(e: Evidence, emit: Emit) -> Saved | None:
+    """The controller of a run that knows γ; None where there is none."""
+    places = e.folder / "controller" / "with_gamma", e.folder / "controller"
+    folder = next((p for p in places if (p / "controller.json").is_file()), None)
+    return None if folder is None else Saved(e, folder, saved_data(folder), emit)
+
+
+@final
+class _Kept:
+    """How far a proof has come, in the user's own cache: a folder of somebody else's says nothing that would be believed."""
+
+    def __init__(self, path: Path | None) -> None:
+        self.path, self.begin, self._last = path, 0, 0.0
+        if path is not None:
+            with suppress(OSError, ValueError):
+                if path.stat().st_uid == os.geteuid():
+                    self.begin = int(path.read_text())
+
+    @classmethod
+    def of(cls, saved: Saved) -> _Kept:
+        """Of everything that the proof is about, and of the code that does it."""
+        total = hashlib.sha256(__version__.encode())
+        run, own = saved.evidence.folder, Path(__file__).parent
+        files = [run / n for n in ("certificate.json", "certificate.npz", "spec.json", "run.json")]
+        files += [saved.folder / "controller.json", saved.folder / "controller.npz"]
+        files += sorted(own.glob("*.py")) + sorted(own.parent.glob("*.py"))
+        if saved._section.get("growth"):
+            files.append(saved.home / saved._section["growth"]["model"])
+        for path in files:
+            total.update(hashlib.sha256(path.read_bytes() if path.is_file() else b"").digest())
+        try:
+            home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gapcert" / "verify"
+            home.mkdir(mode=0o700, parents=True, exist_ok=True)
+            return cls(home / total.hexdigest() if home.stat().st_uid == os.geteuid() else None)
+        except (OSError, RuntimeError):
+            return cls(None)  # nothing is kept then
+
+    def done(self, count: int, total: int) -> None:
+        """Keep it, at most every other second; what is finished is forgotten."""
+        if self.path is None or (time.monotonic() - self._last < 2.0 and count < total):
+            return
+        self._last = time.monotonic()
+        with suppress(OSError):
+            if count < total:
+                write_atomic(self.path, str(count).encode(), flush=False)
+            else:
+                self.path.unlink(missing_ok=True)

@@ -1,0 +1,203 @@
+"""Small specs with controllers on cells of every kind, and saved controllers changed as a forger would change them."""
+
+import hashlib
+import json
+import shutil
+
+import numpy as np
+
+import gapcert as gc
+from gapcert_cells import AutomatonController, GridController, load_controller
+
+TANK = {
+    "kind": "equations",
+    "states": {"h": "m", "v": "m/s"},
+    "inputs": {"a": "m/s^2"},
+    "parameters": {"k": "0.3 1/m", "c": "0.4 1/s"},
+    "derivative": {"h": "v", "v": "a - c*v*(1 + k*h)"},
+    "integrator": "rk4",
+    "substeps": 2,
+    "period": "200 ms",
+}
+CAR = {
+    "kind": "equations",
+    "states": {"x": "m", "phi": {"unit": "rad", "kind": "angle"}},
+    "inputs": {"w": "rad/s"},
+    "parameters": {"s": "1.5 m/s"},
+    "derivative": {"x": "s*sin(phi)", "phi": "w"},
+    "integrator": "euler",
+    "period": "0.2 s",
+}
+SLED = {
+    "kind": "equations",
+    "coordinates": {"q": "m"},
+    "inputs": {"F": "N"},
+    "parameters": {"m": "800 g", "g": "9.81 m/s^2", "mu": "0.02"},
+    "mass_matrix": [["m"]],
+    "forces": {"q": "F"},
+    "dry_friction": {"q": "mu*m*g"},
+    "integrator": "semi_implicit",
+    "period": "0.25 s",
+}
+PLATE = {
+    "kind": "equations",
+    "states": {"x": "m", "y": "m", "v": "m/s"},
+    "inputs": {"u": "m/s", "w": "m/s"},
+    "parameters": {"tau": "0.5 s"},
+    "next": {"x": "x + tau*u", "y": "y + tau*w", "v": "u"},
+    "period": "0.5 s",
+}
+FULL = 6.283185307179586
+HALL = {"x": [0, 4], "y": [0, 4]}
+
+
+def drifting(model, **terms):
+    """A backend that is the model with terms added to some of its right-hand sides."""
+    made = json.loads(json.dumps(model))
+    for part in ("derivative", "next", "forces"):
+        for name in set(terms) & set(made.get(part) or {}):
+            made[part][name] += f" + {terms[name]}"
+    return made
+
+
+def spec(name, model, domain, controller, gamma=None, backend=None, **more):
+    made = {"version": 1, "name": name, "model": model, "domain": domain, "controller": {"kind": "symbolic", **controller}}
+    made |= {"report": {"html": False, "rerun": False}}
+    if gamma is not None:
+        return made | {"gap": {"kind": "declared", "gamma": gamma}} | more
+    made |= {
+        "backend": backend,
+        "sampling": {"kind": "adaptive", "budget": 60},
+        "lipschitz": {"residual": {"kind": "interval"}},
+    }
+    return made | {"certificate": {"claim": "deterministic", "violation": 0.05, "confidence": 0.9}} | more
+
+
+def specs():
+    """Name → spec: a uniform, a refined, an automaton's and a held controller at least, on lines, circles and behind relations."""
+    room, belt = {"h": [0, 2], "v": [-1, 1]}, {"x": [-2, 2], "phi": [0, FULL]}
+    slow = drifting(TANK, v="0.03*a")
+    path = {"kind": "equations", "states": {"x": "m", "y": "m"}, "inputs": {"u": "m/s", "w": "m/s"}}
+    path |= {"parameters": {"tau": "0.5 s"}, "next": {"x": "x + tau*u", "y": "y + tau*w"}, "period": "0.5 s"}
+    visits = {"ltl": "F a & F b", "regions": {"a": {"x": [0, 1]}, "b": {"x": [3, 4], "y": [2.5, 4]}}}
+    visits["avoid"] = [{"x": [1.6, 2.4], "y": [0, 1.4]}]
+    forever = {"ltl": "G F a & G F b", "regions": visits["regions"]}
+    steps = {"u": [-1, 1], "w": [-1, 1]}
+    return {
+        "staying": spec(
+            "staying",
+            TANK,
+            {**room, "a": [-1, 1]},
+            {"goal": {"invariance": {"h": [0.2, 1.8], "v": [-0.8, 0.8]}}, "cells": {"h": 31, "v": 40}, "inputs": {"a": 5}},
+            backend=slow,
+        ),
+        "affine": spec(
+            "affine",
+            TANK,
+            {**room, "a": [-1, 1]},
+            {
+                "goal": {"reach_and_stay": {"target": {"h": [0.9, 1.2], "v": [-0.3, 0.3]}}},
+                "cells": {"h": 50, "v": 40},
+                "inputs": {"a": 7},
+            },
+            backend=slow,
+            gap={"kind": "envelope", "predictor": "affine"},
+        ),
+        "refined": spec(
+            "refined",
+            TANK,
+            {**room, "a": [-1, 1]},
+            {"goal": {"invariance": {"h": [0, 2], "v": [-1, 1]}}, "cells": {"h": 8, "v": 10}, "inputs": {"a": 5}, "refine": 3},
+            gamma={"h": 1e-3, "v": 4e-3},
+        ),
+        "circle": spec(
+            "circle",
+            CAR,
+            {**belt, "w": [-2, 2]},
+            {
+                "goal": {"reach_avoid": {"target": {"x": [1, 2]}, "avoid": [{"x": [-0.2, 0.1], "phi": [2, 4]}]}},
+                "cells": {"x": 40, "phi": 36},
+                "inputs": {"w": 5},
+            },
+            gamma={"x": 2e-3, "phi": 1e-3},
+        ),
+        "again": spec(
+            "again",
+            CAR,
+            {**belt, "w": [-2, 2]},
+            {"goal": {"recurrence": {"target": {"x": [-0.5, 0.5]}}}, "cells": {"x": 30, "phi": 24}, "inputs": {"w": 5}},
+            gamma={"x": 2e-3, "phi": 1e-3},
+        ),
+        "sled": spec(
+            "sled",
+            SLED,
+            {"q": [-1, 1], "q_dot": [-1, 1], "F": [-1, 1]},
+            {"goal": {"invariance": {"q": [-1, 1], "q_dot": [-1, 1]}}, "cells": {"q": 40, "q_dot": 41}, "inputs": {"F": 9}},
+            backend=drifting(SLED, q="0.04*F"),
+            gap={"kind": "envelope", "predictor": "none"},
+        ),
+        "tour": spec(
+            "tour",
+            path,
+            {**HALL, **steps},
+            {"goal": visits, "cells": {"x": 20, "y": 16}, "inputs": {"u": 5, "w": 5}},
+            gamma={"x": 5e-3, "y": 5e-3},
+        ),
+        "finer": spec(
+            "finer",
+            path,
+            {**HALL, **steps},
+            {"goal": visits, "cells": {"x": 7, "y": 6}, "inputs": {"u": 5, "w": 5}, "refine": 2},
+            gamma={"x": 5e-3, "y": 5e-3},
+        ),
+        "forever": spec(
+            "forever",
+            path,
+            {**HALL, **steps},
+            {"goal": forever, "cells": {"x": 20, "y": 16}, "inputs": {"u": 5, "w": 5}},
+            gamma={"x": 5e-3, "y": 5e-3},
+        ),
+        "held": spec(
+            "held",
+            PLATE,
+            {**HALL, "v": [-1, 1], "u": [-1, 1], "w": [-1, 1]},
+            {
+                "goal": {"reach_avoid": {"target": {"x": [3, 4], "y": [3, 4]}, "avoid": [{"x": [1, 2], "y": [1, 2]}]}},
+                "on": ["x", "y"],
+                "cells": {"x": 24, "y": 24},
+                "inputs": {"u": 5, "w": 5},
+                "input_range": {"u": [-0.24, 0.24], "w": [-0.4, 0.4]},
+            },
+            backend=drifting(PLATE, x="0.01*tau*v"),
+            relations=["abs(u - v) <= 0.5 m/s"],
+        ),
+    }
+
+
+def reforged(run, change):
+    """Change the controller with γ of a run and write it anew, with every digest mended."""
+    folder = run / "controller" / "with_gamma"
+    c = load_controller(folder)
+    assert isinstance(c, GridController | AutomatonController)
+    shutil.rmtree(folder)
+    change(c).save(folder)
+
+
+def relinked(run):
+    """The controller names the certificate as it is now."""
+    path = run / "controller" / "with_gamma" / "controller.json"
+    data = json.loads(path.read_text())
+    data["evidence"]["certificate"] = hashlib.sha256((run / "certificate.json").read_bytes()).hexdigest()
+    path.write_text(json.dumps(data))
+
+
+def made(folder):
+    """A run folder of each spec."""
+    return {name: gc.run(s, out=folder).folder for name, s in specs().items()}
+
+
+def flipped(c, cell, which):
+    """One bit more of a controller's inputs."""
+    bits = c.bits.copy()
+    bits[cell, which >> 3] |= np.uint8(128 >> (which & 7))
+    return bits
