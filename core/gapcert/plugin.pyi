@@ -33,7 +33,6 @@ from gapcert.certification.routes import Route as Route
 from gapcert.certification.samples.executors import processes as processes
 from gapcert.certification.samples.store import Store as Store
 from gapcert.certification.supremum import supremum as supremum
-from gapcert.cli.listing import entry as entry
 from gapcert.cli.terminal import Terminal as Terminal
 from gapcert.contracts.controllers.control import Controller as Controller
 from gapcert.contracts.controllers.control import SynthesisProblem as SynthesisProblem

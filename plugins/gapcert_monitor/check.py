@@ -13,7 +13,23 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array, Claim, Interval, Model, Recording, Trajectory, UsageError
-from gapcert.plugin import Band, Box, Coordinates, Domain, Ints, RelativeModel, Statement, Zone, circle, damage_told, difference, magnitude, order_statistics, stated_units, without_units
+from gapcert.plugin import (
+    Band,
+    Box,
+    Coordinates,
+    Domain,
+    Ints,
+    RelativeModel,
+    Statement,
+    Zone,
+    circle,
+    damage_told,
+    difference,
+    magnitude,
+    order_statistics,
+    stated_units,
+    without_units,
+)
 from gapcert_monitor.thresholds import THRESHOLDS
 from gapcert_recordings import Copies, Transitions, axes
 from gapcert_verify import Evidence, bounds, load, zone

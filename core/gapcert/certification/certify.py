@@ -18,8 +18,8 @@ from typing import Any, final
 import numpy as np
 from numpy.random import Generator
 
-from gapcert.certification.certificate import Audit, Certificate, Record, figures, gap_digest, points_refute
 from gapcert.certification import contradiction
+from gapcert.certification.certificate import Audit, Certificate, Record, figures, gap_digest, points_refute
 from gapcert.certification.compatibility import refuse, unpaired
 from gapcert.certification.fingerprint import Fingerprint, digest
 from gapcert.certification.gates import entry, hidden_state

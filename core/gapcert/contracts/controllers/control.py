@@ -15,7 +15,7 @@ from gapcert.contracts.controllers.goal import Goal
 from gapcert.contracts.controllers.policies import ANYWHERE, Policy
 from gapcert.contracts.gaps.gap import GapFunction
 from gapcert.contracts.plugins.events import Emit, silent
-from gapcert.contracts.systems.domain import Domain, Outside, turned
+from gapcert.contracts.systems.domain import Domain, Outside
 from gapcert.contracts.systems.system import Model
 from gapcert.numerics.arrays import Array, Bools, Ints
 
