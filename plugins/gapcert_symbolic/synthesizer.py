@@ -14,6 +14,7 @@ import numpy as np
 from gapcert import Array, Box, Domain, GapFunction, Goal, MissingDependency, Model, Region, SynthesisProblem, UsageError
 from gapcert.plugin import Bools, Ints, Policy, Pulse, Synthesizer, magnitude
 from gapcert_cells import GROWTH, SEEN, AutomatonController, GridController, Successors
+from gapcert_symbolic.thresholds import THRESHOLDS
 
 from .cells.abstraction import Windows, check_size, windows
 from .cells.bounds import Bound, Enclosed, Grown, inferred
