@@ -39,11 +39,12 @@ class Queries:
 
 
 def queries(system: System, domain: Domain, seed: int) -> Queries:
-    """Random rows of the domain, its centre, and ladders; hidden states are moved too: purity is about all arguments."""
+    """Random rows of Z, its centre, and ladders in it; hidden states are moved too: purity is about all arguments."""
     rng = np.random.default_rng([seed, 0x9075])
     z = np.vstack([domain.draw(THRESHOLDS.purity_rows, rng), domain.centre])
     x, u = (np.ascontiguousarray(part) for part in domain.split(z))
-    return laddered(system, Queries(x, u, moved(system, len(x), rng) if system.hidden else None))
+    rows = laddered(system, Queries(x, u, moved(system, len(x), rng) if system.hidden else None))
+    return rows[domain.zone.related(np.hstack([rows.x, rows.u]))]
 
 
 def laddered(system: System, rows: Queries) -> Queries:

@@ -75,8 +75,8 @@ def named(backend: Arithmetic, model: Arithmetic, names: Sequence[str]) -> list[
 def _largest(system: System, domain: Domain) -> Array:
     """Max |x⁺| (nx,) on Z's corners and centre. Where relations cut a corner off, the last point of Z on the way stands in."""
     corners = np.stack(np.meshgrid(*zip(domain.low, (domain.low + domain.high) / 2, domain.high, strict=True)), axis=-1)
-    x, u = domain.split(domain.reach(domain.centre, corners.reshape(-1, len(domain.low))))
-    return np.asarray(np.abs(system.step(x, u).x).max(axis=0))
+    z = domain.reach(domain.centre, corners.reshape(-1, len(domain.low)))
+    return np.asarray(np.abs(system.step(z[:, : system.nx], z[:, system.nx :]).x).max(axis=0))
 
 
 def _covered(model: Model, domain: Domain, bound: Array, points: Array) -> tuple[Interval, Array, Array]:
