@@ -42,8 +42,7 @@ class Arithmetic:
                 return cls(np.maximum(stated, np.where(np.isfinite(least), 2 * least, 0.0)))
         # f̂ − f, whole turns of it, and r − p round in turn, by u = eps / 2 of |f̂| + |f| or of that and a few turns.
         e = bound.max(axis=0) + 2 * np.finfo(float).eps * system.enclosure(boxes).mag.max(axis=0)
-        x, u = domain.split(points)
-        plain = e <= THRESHOLDS.rounding_plain * system.resolution(np.abs(system.step(x, u).x).max(axis=0))
+        plain = e <= THRESHOLDS.rounding_plain * system.resolution(_size(system, points))
         worst = ("",) * len(e) if plain.all() else system.rounding_terms(boxes[(bound / e).max(axis=1).argmax()][None])
         return cls(e, True, tuple("" if small else term for small, term in zip(plain, worst, strict=True)))
 
@@ -75,7 +74,10 @@ def named(backend: Arithmetic, model: Arithmetic, names: Sequence[str]) -> list[
 def _largest(system: System, domain: Domain) -> Array:
     """Max |x⁺| (nx,) on Z's corners and centre. Where relations cut a corner off, the last point of Z on the way stands in."""
     corners = np.stack(np.meshgrid(*zip(domain.low, (domain.low + domain.high) / 2, domain.high, strict=True)), axis=-1)
-    z = domain.reach(domain.centre, corners.reshape(-1, len(domain.low)))
+    return _size(system, domain.reach(domain.centre, corners.reshape(-1, len(domain.low))))
+
+
+def _size(system: System, z: Array) -> Array:
     return np.asarray(np.abs(system.step(z[:, : system.nx], z[:, system.nx :]).x).max(axis=0))
 
 
