@@ -208,7 +208,7 @@ def test_a_full_turn_has_no_outside(low: float, tmp_path: Path) -> None:
     )
     export(c, "numpy", tmp_path)
     ends = (low + 2 * np.pi * np.arange(-20, 21))[:, None]
-    x = (ends.view(np.int64) + np.arange(-400, 401)).view(np.float64).reshape(-1, 1)
+    x = (ends + np.arange(-400, 401) * np.spacing(np.abs(ends))).reshape(-1, 1)
     x = np.concatenate([x, np.random.default_rng(0).uniform(-130, 130, (20_000, 1))])
     assert c.contains(x).all()
     assert np.array_equal(imported(tmp_path / "controller.py").Controller().act(x), c.act(x, "first"))

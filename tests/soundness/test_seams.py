@@ -68,7 +68,7 @@ def begun(c: GridController, rng: np.random.Generator, n: int) -> np.ndarray:
     edge = rng.random(len(x)) < 0.5
     x[edge, 0] = rng.choice(c.edges[0], int(edge.sum()))
     x[:, 0] += TURN * rng.integers(-AWAY, AWAY + 1, len(x))
-    x[:, 0] = (x[:, 0].copy().view(np.int64) + rng.integers(-2, 3, len(x))).view(np.float64)
+    x[:, 0] += rng.integers(-2, 3, len(x)) * np.spacing(np.abs(x[:, 0]))
     return x[c.contains(x)][:n]
 
 
