@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 MOST_BANDS = 12  # beside those that lead: more make a page that nobody scrolls through
 GAP = "gap"  # pictures with one cursor
-_HATCHED: dict[str, Any] = {"facecolor": "none", "edgecolor": FAINT, "hatch": "///"}  # no bound, and nothing like one
+_HOLLOW: dict[str, Any] = {"facecolor": "none", "edgecolor": FAINT, "lw": 0.8}  # no bound, and nothing like one
 
 
 def slice_pictures(gap: GapFigure, refuted: bool = False) -> list[Picture]:
@@ -59,13 +59,14 @@ def _band(key: str, b: Band, refuted: bool) -> Picture:
     unit, label = scaled(b.unit, b.gamma, np.asarray(b.constant))
 
     def on(ax: Axes) -> None:
-        for low, high, alpha, name in ((-b.gamma, b.gamma, 0.16, "±γ"), (b.low, b.high, 0.55, "[l, u]")):
-            shown = {**_HATCHED, "label": f"{name}, refuted"} if refuted else {"color": WITH, "alpha": alpha, "label": name}
+        for low, high, alpha, hatch, name in ((-b.gamma, b.gamma, 0.16, "", "±γ"), (b.low, b.high, 0.55, "////", "[l, u]")):
+            hollow = {**_HOLLOW, "hatch": hatch, "label": f"{name}, refuted"}
+            shown = hollow if refuted else {"color": WITH, "alpha": alpha, "label": name, "lw": 0}
             if (some := low <= high).any():
-                ax.fill_between(b.at, low / unit, high / unit, where=some, lw=0, **shown)
+                ax.fill_between(b.at, low / unit, high / unit, where=some, **shown)
         if b.empty.any():
-            crossed = {**_HATCHED, "edgecolor": BAD, "hatch": "xxx", "label": "no band: l above u"}
-            ax.fill_between(b.at, b.high / unit, b.low / unit, where=b.empty, lw=0, **crossed)
+            crossed = {**_HOLLOW, "edgecolor": BAD, "hatch": "xxxx", "label": "no band: l above u"}
+            ax.fill_between(b.at, b.high / unit, b.low / unit, where=b.empty, **crossed)
         ax.plot(b.at, b.residual / unit, color=TRUTH, lw=1.1, label="f̂ − f")
         for sign in (-1, 1):
             ax.axhline(sign * b.constant / unit, color=FAINT, ls="--", lw=1, label="constant bound")
