@@ -69,8 +69,18 @@ def common(a: Range, b: Range) -> Range:
     return Range(np.fmax(a.lo, b.lo), np.fmin(a.hi, b.hi))
 
 
+def zero(a: Range) -> Any:
+    """Where it is 0, exactly."""
+    return (a.lo == 0) & (a.hi == 0)
+
+
 def add(a: Range, b: Range) -> Range:
-    return outward(a.lo + b.lo, a.hi + b.hi)
+    """What adds nothing rounds nothing: a state that an input leaves alone stays where it is."""
+    out = outward(a.lo + b.lo, a.hi + b.hi)
+    for one, other in ((a, b), (b, a)):
+        if np.any(none := zero(other)):
+            out = Range(*(np.where(none, end, o) for end, o in zip(one, out, strict=True)))
+    return out
 
 
 def subtract(a: Range, b: Range) -> Range:
@@ -82,6 +92,13 @@ def negative(a: Range) -> Range:
 
 
 def multiply(a: Range, b: Range) -> Range:
+    out = _product(a, b)
+    if np.any(none := (zero(a) & np.isfinite(b.lo + b.hi)) | (zero(b) & np.isfinite(a.lo + a.hi))):
+        return Range(*(np.where(none, 0.0, o) for o in out))
+    return out
+
+
+def _product(a: Range, b: Range) -> Range:
     if a.lo is a.hi and np.ndim(a.lo) == 0:
         a, b = b, a
     if b.lo is b.hi and np.ndim(b.lo) == 0:

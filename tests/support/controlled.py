@@ -3,11 +3,14 @@
 import hashlib
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 
 import gapcert as gc
 from gapcert_cells import AutomatonController, GridController, load_controller
+from gapcert_verify.controllers import games
+from gapcert_verify.controllers.cells import Cells
 
 TANK = {
     "kind": "equations",
@@ -201,3 +204,115 @@ def flipped(c, cell, which):
     bits = c.bits.copy()
     bits[cell, which >> 3] |= np.uint8(128 >> (which & 7))
     return bits
+
+
+def bit_more(controller, rng):
+    """(forged, cell, part, input): one input more in a cell that wins, or in one that loses and is said to win; None: no such.
+
+    The forger gives a losing cell the value that is easiest to keep, and says so wherever cells are counted.
+    """
+    parts = list(controller.parts) if isinstance(controller, AutomatonController) else [controller]
+    q = int(rng.integers(len(parts)))
+    part = parts[q]
+    whole = np.ones(len(part.values), dtype=bool) if part.splits is None else part.splits.first == 0
+    wins = rng.random() < 0.6
+    cells = np.flatnonzero(whole & ((part.values >= 0) == wins))
+    if not len(cells):
+        return None
+    cell = int(rng.choice(cells))
+    free = np.flatnonzero(part.allowed(np.array([cell]))[0] == 0)
+    if not len(free):
+        return None
+    which, values = int(rng.choice(free)), part.values.astype(np.int32)
+    if not wins:
+        values[cell] = 0 if part.goal.kind == "invariance" else values.max() + 1
+    parts[q] = replace(part, bits=flipped(part, cell, which), values=values)
+    changed = replace(controller, parts=tuple(parts)) if len(parts) > 1 else parts[0]
+    return recounted(changed), cell, q, which
+
+
+def recounted(c):
+    """With the figures of its cells as they are now."""
+    one = c.parts[0] if isinstance(c, AutomatonController) else c
+    found = games.figures(Cells.of(one), c)
+    return replace(c, evidence={**c.evidence, **found})
+
+
+def broken(controller, cell, q, which, flow, rng, n=300):
+    """Does some step from the cell under the input break what the controller promises? flow: (model, gap) that made it."""
+    model, gap = flow
+    parts = controller.parts if isinstance(controller, AutomatonController) else (controller,)
+    only = np.full(len(parts[q].values), -1, dtype=np.int32)
+    only[cell] = 0
+    x = replace(parts[q], values=only).draw(n, rng)
+    u = np.repeat(parts[q].points[which : which + 1], len(x), axis=0)
+    low, high = gap.interval(np.concatenate([x, u], axis=1))
+    after = model.step(x, u).x + np.where(rng.random(x.shape) < 0.5, low, high)
+    lone = replace(parts[q], promised=None)
+    if len(parts) == 1:
+        return not lone.kept(x, u, after).all()
+    free = replace(controller, parts=tuple(replace(p, promised=None) for p in parts))
+    return not free.kept(x, u, after, np.full(len(x), q)).all()
+
+
+BANDS = {
+    "constant": {"gap": {"kind": "constant", "predictor": "affine"}},
+    "cells": {"gap": {"kind": "envelope", "predictor": "none"}, "lipschitz": {"residual": {"kind": "interval", "cells": 12}}},
+    "lattice": {
+        "gap": {"kind": "multilinear", "predictor": "affine"},
+        "lipschitz": {"residual": {"kind": "interval", "curvature": True}},
+        "sampling": {"kind": "lattice", "budget": 120},
+    },
+    "basis": {
+        "gap": {"kind": "basis", "functions": ["1", "abs(h)", "v^2", "abs(a)"]},
+        "sampling": {"kind": "grid", "counts": {"h": 6, "v": 6, "a": 6}},
+    },
+    "lifted": {
+        "gap": {"kind": "basis", "functions": ["1", "abs(a)"]},
+        "certificate": {"claim": "deterministic", "route": "dominate", "violation": 0.05, "confidence": 0.9},
+    },
+    "slopes": {"gap": {"kind": "envelope", "predictor": "multilinear"}},
+    "calibrated": {
+        "gap": {"kind": "envelope", "predictor": "affine"},
+        "certificate": {"claim": "statistical", "route": "calibrate", "violation": 0.05, "confidence": 0.9},
+    },
+}
+
+
+def bands():
+    """Name → the spec `staying` with a gap function of another form."""
+    base = specs()["staying"]
+    backend = drifting(TANK, v="0.03*a + 0.02*(1 1/s)*v") | {
+        "parameters": {**TANK["parameters"], "d": "0.02 1/s", "b": "0.03 1/m^2"}
+    }
+    backend["derivative"] = {"h": "v", "v": "a - c*v*(1 + k*h) + 0.03*a + d*v*cos(2*k*h)"}
+    goal = {**base["controller"], "cells": {"h": 24, "v": 30}}
+    return {name: {**base, "name": name, "backend": backend, "controller": goal, **more} for name, more in BANDS.items()}
+
+
+def others(folder):
+    """Specs that need files beside them, or more than text: inputs beside velocities, a growth bound, an extended model."""
+    room = {"h": [0, 2], "v": [-1, 1], "a": [-1, 1]}
+    near = {**specs()["held"], "name": "beside", "coordinates": {"d": "u - v", "e": "w"}}
+    wide = {**TANK, "parameters": {"k": "0.3 1/m", "c": "0.4 1/s", "tau": "0.2 s"}, "integrator": "euler"}
+    radius = {k: wide[k] for k in ("kind", "states", "inputs", "parameters", "period")}
+    radius["parameters"] = {**wide["parameters"], "fast": "1.1 m/s"}
+    radius["next"] = {"h": "h + tau*v", "v": "v + tau*c*k*h*fast"}
+    (folder / "radius.yaml").write_text(json.dumps({"version": 1, "name": "radius", "model": radius}))
+    (folder / "extended.yaml").write_text(json.dumps({"version": 1, "name": "extended", "model": drifting(TANK, v="0.02*a")}))
+    grown = {
+        "goal": {"invariance": {"h": [0, 2], "v": [-1, 1]}},
+        "align": "scots",
+        "eta": {"h": 0.05, "v": 0.05, "a": 0.25},
+        "growth": {"model": str(folder / "radius.yaml")},
+    }
+    base = specs()["staying"]
+    return {
+        "beside": near,
+        "grown": spec("grown", wide, {**room, "h": [-0.1, 2.1], "v": [-1.1, 1.1]}, grown, gamma={"h": 1e-3, "v": 2e-3}),
+        "extended": {
+            **base,
+            "name": "extended",
+            "gap": {"kind": "envelope", "predictor": {"model": str(folder / "extended.yaml")}},
+        },
+    }

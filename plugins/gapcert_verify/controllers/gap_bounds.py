@@ -46,6 +46,11 @@ class Gap:
         more = np.maximum(own["gap.calibrated.widening"], 0.0) + own["gap.calibrated.resolution"]
         return found + Interval.around(np.zeros_like(more), more)
 
+    def nothing(self, k: int) -> bool:
+        """Is there no gap of state k at all, as declared?"""
+        own = self.evidence
+        return own.data["form"]["form"] == "constant" and own.data["route"] != "calibrate" and not own.arrays["gap.gamma"][k]
+
     def at(self, z: Array) -> tuple[Interval, Interval]:
         """(l, u) at points (x, u), each as an interval around the exact value."""
         if self.relative is None:

@@ -106,7 +106,7 @@ class Proof:
         pair, (low, high) = np.arange(len(rows)), level.boxes(rows)
         weight = self._weights(flow, level)
         for _ in range(DEEP * len(level.axes)):
-            wrong = ~self._right(flow, level, height, low, high, which[pair], limit[pair])
+            wrong = ~self._right(flow, level, height, (low, high), rows[pair], which[pair], limit[pair])
             if not wrong.any():
                 return ""
             pair, low, high = pair[wrong], low[wrong], high[wrong]
@@ -139,12 +139,18 @@ class Proof:
         out = (size / widths[:, None]).max(axis=0)
         return np.asarray(np.maximum(out, 1e-9 / widths))
 
-    def _right(self, flow: Flow, level: Level, height: Heights, low: Array, high: Array, which: Ints, limit: Ints) -> Bools:
-        out = np.empty(len(low), dtype=bool)
-        for a in range(0, len(low), 1 << 14):
+    def _right(
+        self, flow: Flow, level: Level, height: Heights, boxes: tuple[Array, Array], rows: Ints, which: Ints, limit: Ints
+    ) -> Bools:
+        """(n,): parts of cells, from boxes[0] to boxes[1], all of whose successors are low enough."""
+        out = np.empty(len(rows), dtype=bool)
+        for a in range(0, len(rows), 1 << 14):
             s = slice(a, a + (1 << 14))
-            ends = [axis.touched(x) for axis, x in zip(level.axes, flow.over(low[s], high[s], which[s]), strict=True)]
-            first, last = (np.stack(end, axis=1) for end in zip(*ends, strict=True))
+            reached = flow.over(boxes[0][s], boxes[1][s], which[s])
+            first, last = np.empty((2, len(reached[0].lo), len(level.axes)), dtype=np.int64)
+            for k, (axis, x) in enumerate(zip(level.axes, reached, strict=True)):
+                still, own = flow.still(k, which[s]), level.index[rows[s], k]
+                first[:, k], last[:, k] = (np.where(still, own, end) for end in axis.touched(x))
             out[s] = height.over(first, last) <= limit[s]
         return out
 

@@ -41,6 +41,7 @@ from .gap_bounds import Gap, coordinates
 from .grid_proof import Proof
 from .successors import Flow, Growth
 
+PAUSE = 2.0  # seconds between two notes of how far a proof is
 Check = tuple[str, Callable[[Evidence], str | None]]
 
 
@@ -320,8 +321,8 @@ class Saved:
         kept, pulse = _Kept.of(self), Pulse(self.emit, "controller", cells.size, "cells", "proof")
 
         def tick(done: int, total: int) -> None:
-            pulse(done)
             kept.done(done, total)
+            pulse(done)
 
         return Proof(cells, found, flow, self._zone, tick, kept.begin).run()
 
@@ -365,7 +366,7 @@ class _Kept:
 
     def done(self, count: int, total: int) -> None:
         """Keep it, at most every other second; what is finished is forgotten."""
-        if self.path is None or (time.monotonic() - self._last < 2.0 and count < total):
+        if self.path is None or (time.monotonic() - self._last < PAUSE and count < total):
             return
         self._last = time.monotonic()
         with suppress(OSError):

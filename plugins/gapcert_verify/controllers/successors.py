@@ -11,7 +11,7 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.plugin import Array, Ints
+from gapcert.plugin import Array, Bools, Ints
 from gapcert_verify import arithmetic as ar
 from gapcert_verify.arithmetic import Range
 from gapcert_verify.evaluator import Equations, Term
@@ -61,6 +61,15 @@ class Flow:
             return out
         r = self.gap.over(*(np.concatenate([end, u], axis=1) for end in (low, high)))
         return [ar.add(x, Range(r.lo[:, k], r.hi[:, k])) for k, x in enumerate(out)]
+
+    def still(self, k: int, which: Ints) -> Bools:
+        """(n,): these inputs, by number, leave state k exactly where it is, whatever it is, and so does the gap."""
+        beside, u = self.model.moves(k), self.points[which]
+        pushed = self.gap is not None and not self.gap.nothing(k)
+        if beside is None or self.growth is not None or pushed or any(j < self.model.nx for j in beside.on):
+            return np.zeros(len(which), dtype=bool)
+        z = np.concatenate([np.zeros((len(u), self.model.nx)), u], axis=1)
+        return np.asarray(ar.zero(self.model.over(z, z, beside)))
 
     def certain(self, x: Array, which: Ints) -> list[list[Range]]:
         """Two of the states that a step from each x (n, nx) may lead to: f + l and f + u. None where a bound stands between."""
@@ -221,13 +230,16 @@ class _Part:
             put = [r.blocks[len(level.axes) + e][digit[:, e]][None] for e in range(digit.shape[1])]
             at = np.ravel_multi_index([np.broadcast_to(c, x.lo.shape) for c in (*cell, *put)], r.counts)
             x = ar.add(x, Range(r.low[at, self.k], r.high[at, self.k]))
-        if self.moves:
-            low, high = axis.edges[index[:, self.k]], axis.edges[index[:, self.k] + 1]
-            if windows.flow.growth is not None:
-                low = high = low / 2 + high / 2
-            x = ar.add(x, Range(low[:, None], high[:, None]))
-        with np.errstate(invalid="ignore"):
+        if not self.moves:
             return axis.touched(ar.known(x))
+        own = index[:, self.k, None]
+        low, high = axis.edges[own], axis.edges[own + 1]
+        if windows.flow.growth is not None:
+            return axis.touched(ar.known(ar.add(x, ar.point(low / 2 + high / 2))))
+        # The upper edge is the next cell's: what does not move at all does not come there.
+        first, last = axis.touched(ar.known(ar.add(x, Range(low, high))))
+        still = ar.zero(x)
+        return np.where(still, own, first), np.where(still, own, last)
 
     def _of_model(self, windows: Windows, index: npt.NDArray[np.int32]) -> Range:
         """The term over cells that differ in what it depends on, (rows, columns)."""
