@@ -292,7 +292,7 @@ def conclude(
 ) -> Certificate:
     """Evidence and the strongest claim, of those asked for, that the evidence allows."""
     route, request, model = question.route, question.request, question.model
-    refuted = route.refuted(problem, gap) or contradiction.by_audit(problem, audited.z, audited.r)
+    refuted = route.refuted(problem, gap) or (contradiction.by_audit(problem, audited.z, audited.r) if record is None else None)
     moved = partial(ledger.enter, question.identity, "hidden state", f"{gap_digest(gap, problem)}:{store.key}")
     gate = hidden_state.attacked(gate, gap, problem, model, moved, store.emit)
     whole, fresh = Residual(store.residual.backend, model), audited.entry.draws(problem.seed, "attack")
