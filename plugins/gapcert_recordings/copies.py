@@ -7,7 +7,7 @@ what is measured has noise of its own; nor are two logs that stand still at the 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import final
@@ -20,6 +20,7 @@ from gapcert_recordings.thresholds import THRESHOLDS
 
 Rows = npt.NDArray[np.intp]
 _EPS = float(np.finfo(np.float64).eps)
+SINGLE_DIGITS = 7  # that single precision keeps: any number of it has more
 
 
 @final
@@ -147,15 +148,31 @@ class _Series:
 
 
 def _form(v: Array) -> tuple[int, int, bool]:
-    """(digits behind the point, digits in all, is it single precision?) with which values (T,) are written; 17 where more."""
+    """(digits behind the point, digits in all, was it in single precision?) of how values (T,) are written; 17 where more."""
     known = v[np.isfinite(v) & (v != 0)]
     some = known[:: max(1, len(known) // THRESHOLDS.form_values)]
-    near = 4 * _EPS * np.abs(some)
-    behind = next((d for d in range(13) if (np.abs(np.round(some, d) - some) <= near).all()), 17)
     with np.errstate(over="ignore", under="ignore"):
-        power = 10.0 ** np.floor(np.log10(np.abs(some)))
-        digits = next((d for d in range(1, 15) if (np.abs(np.round(some / power, d - 1) * power - some) <= near).all()), 17)
-        return behind, digits, bool((some.astype(np.float32) == some).all()) and digits == 17
+        single = some.astype(np.float32)
+    plain = _digits(some, 4 * _EPS * np.abs(some))
+    # What was rounded first and written in single precision next, or the other way round, was both.
+    if (np.abs(single - some) <= _quantum(some, (*plain, False))).all():
+        behind, digits = _digits(some, 0.6 * np.spacing(np.abs(single)).astype(np.float64))
+        return (behind, digits, True) if digits <= SINGLE_DIGITS else (17, 17, True)
+    return *plain, False
+
+
+def _single(s: _Series, values: Array) -> Array:
+    """(n, c): how far single precision puts numbers apart, where a channel was in it."""
+    size = np.maximum(np.abs(np.nan_to_num(values)), np.finfo(np.float32).tiny)
+    return np.where([form[2] for form in s.forms], np.spacing(size.astype(np.float32)).astype(np.float64), 0.0)
+
+
+def _digits(v: Array, near: Array) -> tuple[int, int]:
+    """(behind the point, in all) that give values (n,) to within `near`."""
+    power = 10.0 ** np.floor(np.log10(np.abs(v)))
+    behind = next((d for d in range(13) if (np.abs(np.round(v, d) - v) <= near).all()), 17)
+    digits = next((d for d in range(1, 15) if (np.abs(np.round(v / power, d - 1) * power - v) <= near).all()), 17)
+    return behind, digits
 
 
 def _quantum(v: Array, form: tuple[int, int, bool]) -> Array:
@@ -190,22 +207,15 @@ def _meetings(series: Sequence[_Series], within: bool) -> dict[tuple[int, int], 
     Where several rows lie alike, and as far apart in both, they are worth a look. Trajectories may be sampled at other rates.
     """
     found: dict[tuple[int, int], list[Array]] = {}
-    periods = [float(np.median(np.diff(s.t))) for s in series]
-    points = _scaled(series)
-    slower = _distinct(periods) if len(_distinct(periods)) > 1 else []
-    for slowest in [0.0, *slower]:
-        # First row by row, whatever the clocks say; then every so many rows of those that are sampled faster.
-        ratio = [slowest / period if slowest and period > 0 else 1.0 for period in periods]
-        every = {i: round(r) for i, r in enumerate(ratio) if r > 0.98 and abs(r - round(r)) < 0.02 * r}
-        if slowest and max(every.values()) == 1:
-            continue
-        for a, b, shift in _alike(points, every, within):
+    periods, points, every = [float(np.median(np.diff(s.t))) for s in series], _scaled(series), range(len(series))
+    slower = _distinct(periods)
+    ratios = {round(p / q) for p, q in itertools.combinations(slower, 2)}
+    for step in sorted({1, *THRESHOLDS.copy_steps, *(r for r in ratios if r <= THRESHOLDS.copy_ratio)}):
+        for a, b, fine, shift in _alike(points, step, within):
             rows = np.arange(len(series[b].t))
-            if every[b] == 1:
-                found.setdefault((a, b), []).append(every[a] * rows + float(shift))
-            elif every[a] == 1:
-                found.setdefault((a, b), []).append((rows - float(shift)) / every[b])
-    for a, b in itertools.combinations(range(len(series)), 2) if slower else ():
+            place = step * rows + float(shift) if fine == a else (rows - float(shift)) / step
+            found.setdefault((a, b), []).append(place)
+    for a, b in itertools.combinations(every, 2) if len(slower) > 1 else ():
         if abs(periods[a] - periods[b]) > 0.02 * periods[a]:
             found.setdefault((a, b), []).extend(_resampled(series[a], series[b]))
     return found
@@ -223,44 +233,57 @@ def _distinct(periods: Sequence[float]) -> list[float]:
 def _scaled(series: Sequence[_Series]) -> list[Array]:
     """Values (T, c) of the channels that tell most, in units of what their digits leave open."""
     every, quantum = (np.concatenate([getattr(s, n) for s in series]) for n in ("values", "quantum"))
-    alike = np.array([len({s.forms[j] for s in series}) == 1 for j in range(every.shape[1])])
+    alike = np.array([len({s.forms[j][:2] for s in series}) == 1 for j in range(every.shape[1])])
     size = np.abs(np.nan_to_num(every)).max(axis=0)
-    open_ = np.where(alike, 8 * _EPS * size, 2 * quantum.max(axis=0)) + np.finfo(np.float64).tiny
+    single = np.any([[form[2] for form in s.forms] for s in series], axis=0)
+    same = np.where(single, 2 * np.spacing(size.astype(np.float32)), 8 * _EPS * size)
+    open_ = np.where(alike, same, 2 * quantum.max(axis=0) + same) + np.finfo(np.float64).tiny
     told = np.array([len(np.unique(column)) for column in every.T])
     best = np.argsort(-told - len(every) * series[0].measured, kind="stable")[: THRESHOLDS.copy_channels]
     return [np.nan_to_num(s.values[:, best]) / open_[best] for s in series]
 
 
-def _alike(points: Sequence[Array], every: Mapping[int, int], within: bool) -> Iterator[tuple[int, int, int]]:
-    """(a, b, shift): of what a and b have every so many rows, rows i of a and j of b, i = every_a·j + shift, or the reverse."""
+def _alike(points: Sequence[Array], step: int, within: bool) -> Iterator[tuple[int, int, int, int]]:
+    """(a, b, fine, shift): rows of a and b that are alike where of `fine`, one of both, every step-th row is taken.
+
+    Row i of that one and row j of the other belong together as i = step·j + shift.
+    """
     from scipy.spatial import cKDTree
 
-    parts, rows, of = [], [], []
-    for i, step in every.items():
-        last = len(points[i]) - 3 * THRESHOLDS.copy_lag * step
-        lagged = [points[i][k * THRESHOLDS.copy_lag * step :][: max(last, 0)] for k in range(4)]
-        moving = np.flatnonzero(np.any([(lagged[0] != later).any(axis=1) for later in lagged[1:]], axis=0))
-        # Of rows that are the same, those of neighbours in the order are the nearest.
-        place = np.full((len(moving), 1), 0.5 * i / len(points))
-        parts.append(np.hstack([*(part[moving] for part in lagged), place]))
-        rows.append(moving)
-        of.append(np.full(len(moving), i))
-    z, row, number = np.concatenate(parts), np.concatenate(rows), np.concatenate(of)
-    if len(z) < 2:
+    parts = [_lagged(v, i, k, len(points)) for k in sorted({1, step}) for i, v in enumerate(points)]
+    z, row, number, steps = (np.concatenate(part) for part in zip(*parts, strict=True))
+    asked = np.flatnonzero(steps == 1)
+    asked = asked[:: 1 + len(asked) // (THRESHOLDS.copy_queries if step == 1 else THRESHOLDS.copy_queries // 4)]
+    own = np.flatnonzero(steps == step)
+    if not len(own) or not len(asked):
         return
-    asked = np.arange(0, len(z), 1 + len(z) // THRESHOLDS.copy_queries)
-    tree = cKDTree(z, balanced_tree=False, compact_nodes=False)
+    tree = cKDTree(z[own], balanced_tree=False, compact_nodes=False)
     near = tree.query(z[asked], k=THRESHOLDS.copy_neighbours, p=np.inf, distance_upper_bound=1.0 + 1e-6)[1]
-    i, j = np.repeat(asked, near.shape[1]), near.reshape(-1)
-    i, j = i[j < len(z)], j[j < len(z)]
-    steps = np.array([every.get(k, 0) for k in range(len(points))])
-    swap = (number[i] > number[j]) | ((number[i] == number[j]) & (row[i] > row[j]))
-    i, j = np.where(swap, j, i), np.where(swap, i, j)
-    a, b = number[i], number[j]
-    shift = np.where(steps[b] == 1, row[i] - steps[a] * row[j], row[j] - steps[b] * row[i])
-    apart = (a != b) | (within & (np.abs(row[i] - row[j]) >= THRESHOLDS.copy_apart))
-    met, votes = np.unique(np.stack([a, b, shift], axis=1)[apart], axis=0, return_counts=True)
-    yield from (tuple(m) for m in met[votes >= THRESHOLDS.copy_votes].tolist())
+    i, j = near.reshape(-1), np.repeat(asked, near.shape[1])
+    i, j = own[i[i < len(own)]], j[i < len(own)]
+    shift, apart = row[i] - step * row[j], number[i] != number[j]
+    if step == 1:
+        # Each of two is found beside the other.
+        first = (number[i] < number[j]) | ((number[i] == number[j]) & (row[i] < row[j]))
+        apart = first & (apart | (within & (row[j] - row[i] >= THRESHOLDS.copy_apart)))
+    a, b = np.minimum(number[i], number[j]), np.maximum(number[i], number[j])
+    met, votes = np.unique(np.stack([a, b, number[i], shift], axis=1)[apart], axis=0, return_counts=True)
+    met, votes = met[votes >= THRESHOLDS.copy_votes], votes[votes >= THRESHOLDS.copy_votes]
+    best = np.lexsort((-votes, met[:, 1], met[:, 0]))
+    start = np.unique(met[best, :2], axis=0, return_index=True)[1]
+    for k, stop in itertools.pairwise([*start.tolist(), len(best)]):
+        yield from (tuple(m) for m in met[best[k : min(stop, k + THRESHOLDS.copy_places)]].tolist())
+
+
+def _lagged(v: Array, number: int, step: int, count: int) -> tuple[Array, Rows, Rows, Rows]:
+    """Rows of one trajectory with some that follow every so many, where those are not all the same; row, number and step."""
+    apart = THRESHOLDS.copy_lag * step
+    lagged = [v[k * apart :][: max(len(v) - 3 * apart, 0)] for k in range(4)]
+    moving = np.flatnonzero(np.any([(lagged[0] != later).any(axis=1) for later in lagged[1:]], axis=0))
+    # Of rows that are the same, those of neighbours in the order are the nearest.
+    place = np.full((len(moving), 1), 0.5 * number / count)
+    one = np.ones(len(moving), dtype=np.intp)
+    return np.hstack([*(part[moving] for part in lagged), place]), moving, number * one, step * one
 
 
 def _resampled(a: _Series, b: _Series) -> list[Array]:
@@ -285,26 +308,25 @@ def _shared(a: _Series, b: _Series, at: Array, marked: Bools) -> Bools:
     if a.forms != b.forms:
         same &= ~marked[np.round(at[known]).astype(np.intp)]
     event = np.where(np.isfinite(a.values[np.round(at[known]).astype(np.intp)]), b.moves[known] * b.bits, 0.0).max(axis=1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]])))
-    for start, stop in edges.reshape(-1, 2).tolist():
-        own = event[start:stop]
-        if stop - start >= THRESHOLDS.copy_rows and _told(
-            own, np.delete(same, np.s_[start:stop]), np.delete(event, np.s_[start:stop])
-        ):
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]))).reshape(-1, 2)
+    total = np.concatenate([[0.0], np.cumsum(event)])
+    long = edges[:, 1] - edges[:, 0] >= THRESHOLDS.copy_rows
+    for start, stop in edges[long & (total[edges[:, 1]] - total[edges[:, 0]] >= THRESHOLDS.copy_bits)].tolist():
+        if _told(event[start + 1 : stop], event > 0, same, start, stop):
             out[known[start] : known[stop - 1] + 1] = True
     return out
 
 
-def _told(bits: Array, same: Bools, event: Array) -> bool:
-    """Do the rows of a stretch, with what each tells (n,), tell enough? Beside them in the same alignment: which are the same.
+def _told(bits: Array, event: Bools, same: Bools, start: int, stop: int) -> bool:
+    """Do the rows of a stretch tell enough, with these bits each, beside the others of the alignment?
 
-    Where steps are coarse and noise is small, two measurements may agree in many rows; the others show in how many.
+    Where steps are coarse and noise is small, two measurements may agree in many rows; in how many, the others show.
     """
-    others = same[event > 0]
+    others = np.concatenate([same[:start][event[:start]], same[stop:][event[stop:]]])
     if len(others) >= THRESHOLDS.copy_rows:
         chance = -np.log2((others.sum() + 1) / (len(others) + 2))
         bits = np.where(bits < THRESHOLDS.copy_coarse, np.minimum(bits, chance), bits)
-    return bool(bits[1:].sum() >= THRESHOLDS.copy_bits)
+    return bool(bits.sum() >= THRESHOLDS.copy_bits)
 
 
 def _equal(a: _Series, b: _Series, at: Array, known: Rows) -> Bools:
@@ -314,8 +336,9 @@ def _equal(a: _Series, b: _Series, at: Array, known: Rows) -> Bools:
     high, part = np.minimum(low + 1, len(a.t) - 1), (place - low)[:, None]
     value, own = a.values[low], b.values[known]
     step = np.where(part > 0, a.values[high] - value, 0.0)
-    alike = np.array([p == q for p, q in zip(a.forms, b.forms, strict=True)])
-    rounded = np.where(alike & (part == 0), 0.0, a.quantum[low] + b.quantum[known])
+    alike = np.array([p[:2] == q[:2] for p, q in zip(a.forms, b.forms, strict=True)]) & (part == 0)
+    one, two = a.quantum[low], b.quantum[known]
+    rounded = np.where(alike, 0.0, one + two) + (_single(a, value) + _single(b, own))
     # Where rows lie between others, the digits of the times count as well.
     clock = sum(float(_quantum(s.t, _form(s.t)).max()) for s in (a, b)) / float(np.median(np.diff(a.t)))
     allowed = rounded + 8 * _EPS * np.abs(own) + np.abs(step) * clock
