@@ -298,8 +298,8 @@ def test_an_edited_book_is_told_for_ever(run: Path, edit: Callable[[Any], Any]) 
     book = json.loads((run / "ledger.json").read_text())
     edit(book)
     (run / "ledger.json").write_text(json.dumps(book))
-    assert "the book of audits was edited" in said(certified(run, 3))
-    assert "the book of audits was edited" in said(certified(run, 4))
+    assert "was edited" in said(certified(run, 3))
+    assert "was edited" in said(certified(run, 4))
 
 
 def test_another_question_is_not_counted_with_what_the_book_lacks(run: Path) -> None:
