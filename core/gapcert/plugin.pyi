@@ -56,7 +56,6 @@ from gapcert.contracts.data.recording import Trajectory as Trajectory
 from gapcert.contracts.data.recording import as_numbers as as_numbers
 from gapcert.contracts.data.recording import first_text as first_text
 from gapcert.contracts.data.recording import seconds as seconds
-from gapcert.contracts.data.units import base as base
 from gapcert.contracts.data.units import magnitude as magnitude
 from gapcert.contracts.data.units import pretty as pretty
 from gapcert.contracts.data.units import shown as shown
@@ -155,7 +154,6 @@ from gapcert.numerics.constraint_zone import lattice as lattice
 from gapcert.numerics.counter_rng import keys as keys
 from gapcert.numerics.counter_rng import normals as normals
 from gapcert.numerics.counter_rng import uniforms as uniforms
-from gapcert.numerics.digest import arrays_digest as arrays_digest
 from gapcert.numerics.digest import identity as identity
 from gapcert.numerics.digest import json_digest as json_digest
 from gapcert.numerics.digest import located as located

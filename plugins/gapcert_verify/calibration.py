@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Mapping
 from decimal import Decimal
 from typing import Any
 
 import numpy as np
 
-from gapcert.plugin import Array, Interval, UsageError, arrays_digest, order_statistics
+from gapcert.plugin import Array, Interval, UsageError, order_statistics
 
 from .evidence import Evidence, predictor, uncalibrated
 
@@ -46,16 +47,17 @@ def miscounted(e: Evidence) -> str:
     if "book" not in audit:
         return ""
     key = e.stored(f"audit-{audit['number']}")[0]["key"]
-    own = {
-        k[4:]: v for k, v in e.arrays.items() if k.startswith("gap.") and (made is None or not k.startswith("gap.calibrated."))
-    }
-    text = arrays_digest(own, e.data["family"], e.data["form"], e.data["seed"])
-    text = f"{text}:{key}:{audit['epsilon']!r}:{audit['beta']!r}"
+    of = hashlib.sha256(json.dumps([e.data["family"], e.data["form"], e.data["seed"]], sort_keys=True).encode())
+    for name, array in sorted(e.arrays.items()):
+        if name.startswith("gap.") and (made is None or not name.startswith("gap.calibrated.")):
+            of.update(name[4:].encode() + np.ascontiguousarray(array).tobytes())
+    text = f"{of.hexdigest()}:{key}:{audit['epsilon']!r}:{audit['beta']!r}"
     if made is not None:
         text = f"calibrate:{text}:{made['exceedances']}:{made['repeats']}"
     kind = "audit" if made is None else "calibration"
-    same = audit["book"]["audited"] == hashlib.sha256(text.encode()).hexdigest() and audit["book"]["kind"] == kind
-    return "" if same and audit["book"]["question"] else "the entry in the book is not of what was audited"
+    own = {"number": audit["number"], "kind": kind, "audited": hashlib.sha256(text.encode()).hexdigest()}
+    same = all(audit["book"][k] == v for k, v in own.items()) and audit["book"]["question"]
+    return "" if same else "the entry in the book is not of what was audited"
 
 
 def calibrated(e: Evidence) -> str | None:

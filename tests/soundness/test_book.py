@@ -127,13 +127,13 @@ def test_a_relation_that_cuts_what_the_range_does_not_have_is_no_other_domain() 
     question = plant(0.05)
     wide = gc.Domain.of(question.backend, {"vm": (-2.0, 7.0), "w": (-2.0, 1.0), "a": (-1.0, 1.0)}, ["vm <= 1 m/s"])
     assert Fingerprint(question.model, question.backend, wide).same(kept(question))
-    less = gc.Domain.of(question.backend, {"vm": (-2.0, 1.0), "w": (-2.0, 1.0), "a": (-1.0, 1.0)}, ["vm + w <= 1.9 m/s"])
+    less = gc.Domain.of(question.backend, {"vm": (-2.0, 1.0), "w": (-2.0, 1.0), "a": (-1.0, 1.0)}, ["vm + w <= 1 m/s"])
     assert not Fingerprint(question.model, question.backend, less).same(kept(question))
 
 
 def test_more_orders_than_can_be_tried_are_the_same_question() -> None:
-    """Eight inputs of one range, whose sum alone counts on the diagonal."""
-    n = 8
+    """Five states and inputs of one range, all alike on the diagonal."""
+    n = 5
     model = Drift(n)
     domain = gc.Domain.of(model, {a.name: (-1.0, 1.0) for a in (*model.states, *model.inputs)})
     weights = np.random.default_rng(5).permutation(np.linspace(0.01, 0.02, n))
@@ -167,7 +167,7 @@ def passes(asked: Fingerprint, entry: Entry, seed: int, beta: float) -> bool:
 
 
 def test_trying_again_under_other_spellings_passes_no_more_often_than_beta(tmp_path: Path) -> None:
-    """A false band, and fishers who edit spec, family and seed until it passes. Where every edit was a new question most did."""
+    """A false band, and fishers who edit spec and family until it passes: most of them, were every edit a new question."""
     spellings = [line(name=f"spelling {k}") for k in range(TRIES)]
     lucky = naive = 0
     for fisher in range(FISHERS):
@@ -228,7 +228,7 @@ def test_an_older_book_counts_for_every_spelling_that_it_names(tmp_path: Path) -
     assert numbers(tmp_path, one, "new") == [3]
     assert numbers(tmp_path, one, "new", kind="calibration") == [2]
     assert numbers(tmp_path, other, "newer", "newest") == [4, 5]
-    assert numbers(tmp_path, line(0.2), "e") == [1]
+    assert numbers(tmp_path, line(0.2, "longer"), "e") == [1]
 
 
 @pytest.fixture
@@ -298,8 +298,8 @@ def test_an_edited_book_is_told_for_ever(run: Path, edit: Callable[[Any], Any]) 
     book = json.loads((run / "ledger.json").read_text())
     edit(book)
     (run / "ledger.json").write_text(json.dumps(book))
-    assert "the book of audits was edited" in said(certified(run, 3))
-    assert "the book of audits was edited" in said(certified(run, 4))
+    assert "was edited" in said(certified(run, 3))
+    assert "was edited" in said(certified(run, 4))
 
 
 def test_another_question_is_not_counted_with_what_the_book_lacks(run: Path) -> None:

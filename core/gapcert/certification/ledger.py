@@ -5,7 +5,6 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import json
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,18 +47,16 @@ class Entry:
 
     def summary(self) -> dict[str, Any]:
         """`number`, and in `book` what the book knows it by."""
-        own = ("kind", "question", "audited", *(name for name in ("lost", "edited") if getattr(self, name)))
-        return {"number": self.k} | ({"book": {name: getattr(self, name) for name in own}} if self.question else {})
+        own = {"number": self.k, "kind": self.kind, "question": self.question, "audited": self.audited}
+        damage = {k: v for k, v in (("lost", self.lost), ("edited", self.edited)) if v}
+        return {"number": self.k} | ({"book": own | damage} if self.question else {})
 
     @property
     def warnings(self) -> list[str]:
         """What is wrong with the book."""
-        told = {
-            f"the book of audits lacks {self.lost} that run folders beside it tell of: it was lost or replaced, and what only "
-            f"it had is not counted": self.lost,
-            "the book of audits was edited: what was taken out of it is not counted": self.edited,
-        }
-        return [text for text, so in told.items() if so]
+        lost = f"lacks {self.lost} that run folders beside it tell of, so that it was lost or replaced" if self.lost else ""
+        told = " and ".join(filter(None, (lost, "was edited" if self.edited else "")))
+        return [f"the book of audits {told}; what nothing else tells of is not counted"] if told else []
 
 
 @final
@@ -123,22 +120,18 @@ class Ledger:
     def _told(self) -> set[Line]:
         """What run folders beside the book tell of it."""
         told = set[Line]()
+
+        def noted(part: dict[str, Any]) -> dict[str, Any]:
+            if {"question", "audited"} <= part.keys():
+                told.add((str(part["question"]), str(part["kind"]), int(part["number"]), str(part["audited"])))
+            return part
+
         for path in (p for name in ("certificate", "summary") for p in self.path.parent.glob(f"*/{name}.json")):
             with suppress(*DAMAGE):  # a folder may be anybody's
-                told.update(_lines(json.loads(path.read_text(encoding="utf-8"))))
+                json.loads(path.read_text(encoding="utf-8"), object_hook=noted)
         return told
 
 
 def _seal(book: dict[str, Any]) -> str:
     """SHA-256 of all that is in it."""
     return json_digest({k: v for k, v in book.items() if k != "seal"})
-
-
-def _lines(data: Any) -> Iterator[Line]:
-    """All entries that a certificate or a summary names."""
-    if isinstance(data, dict):
-        if isinstance(book := data.get("book"), dict):
-            yield str(book["question"]), str(book["kind"]), int(data["number"]), str(book["audited"])
-        data = list(data.values())
-    for part in data if isinstance(data, list) else ():
-        yield from _lines(part)

@@ -41,14 +41,6 @@ def json_digest(*parts: Any) -> str:
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 
-def arrays_digest(arrays: Mapping[str, Any], *parts: Any) -> str:
-    """SHA-256 of plain data, keys in order, and of the bytes of arrays by name."""
-    h = hashlib.sha256(json.dumps(parts, sort_keys=True).encode())
-    for name, array in sorted(arrays.items()):
-        h.update(name.encode() + np.ascontiguousarray(array).tobytes())
-    return h.hexdigest()
-
-
 def _canonical(value: Any, apart: Callable[[Any], bool]) -> Any:
     """Data whose `repr` depends neither on the identity of its parts nor on the order of its sets (pickles depend on both)."""
     if value is None or isinstance(value, bool | int | str | bytes):
