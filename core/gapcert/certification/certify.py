@@ -19,7 +19,7 @@ import numpy as np
 from gapcert.certification.certificate import Audit, Certificate, Ledger, Record, figures, gap_digest, points_refute
 from gapcert.certification.compatibility import refuse, unpaired
 from gapcert.certification.gates import entry, hidden_state
-from gapcert.certification.gates.again import InCalls, again
+from gapcert.certification.gates.again import again
 from gapcert.certification.gates.augment import widen
 from gapcert.certification.gates.hidden_state import Gate, HiddenPlan
 from gapcert.certification.refutation import watched
@@ -143,8 +143,8 @@ def digest(model: Model, backend: System, domain: Domain) -> str:
 def stricter(store: Store, gate: Gate, domain: Domain) -> Store:
     """Where points come from that no fit has seen: asked in calls of many sizes, harmless hidden state drawn."""
     system, model = gate.audited or gate.system, store.residual.model
-    residual: Any = InCalls(system, model)
-    return replace(store, residual=residual, key=digest(model, system, domain) if gate.audited else store.key)
+    key = digest(model, system, domain) if gate.audited else store.key
+    return replace(store, residual=Residual(system, model), key=key, in_calls=True)
 
 
 def measure(question: Question, store: Store, gate: Gate) -> GapProblem:
@@ -286,8 +286,7 @@ def conclude(
     route, request, model = question.route, question.request, question.model
     refuted = route.refuted(problem, gap)
     gate = hidden_state.attacked(gate, gap, problem, model, store.emit)
-    whole, n = Residual(store.residual.backend, model), request.attack
-    attacked = attack(gap, whole, problem.domain, n, problem.seed, store.emit) if n else {}
+    attacked = attack(gap, store.residual, problem.domain, request.attack, problem.seed, store.emit) if request.attack else {}
     if record is not None and attacked:
         attacked["allowed"] = record.allowed(request.attack, request.epsilon)
     rests = route.sentences(Findings(problem, gap, record, audited, model, gate, refuted))
