@@ -23,7 +23,7 @@ from gapcert.certification.certificate import Audit, Certificate, Record, figure
 from gapcert.certification.compatibility import refuse, unpaired
 from gapcert.certification.fingerprint import Fingerprint, digest
 from gapcert.certification.gates import entry, hidden_state
-from gapcert.certification.gates.again import InCalls, again
+from gapcert.certification.gates.again import again
 from gapcert.certification.gates.augment import widen
 from gapcert.certification.gates.circle import repeating
 from gapcert.certification.gates.hidden_state import Gate, HiddenPlan
@@ -145,8 +145,8 @@ def _sampling(given: Sampling | None, family: GapFamily, domain: Domain, bounded
 def stricter(store: Store, gate: Gate, domain: Domain) -> Store:
     """Where points come from that no fit has seen: asked in calls of many sizes, harmless hidden state drawn."""
     system, model = gate.audited or gate.system, store.residual.model
-    residual: Any = InCalls(system, model)
-    return replace(store, residual=residual, key=digest(model, system, domain) if gate.audited else store.key)
+    key = digest(model, system, domain) if gate.audited else store.key
+    return replace(store, residual=Residual(system, model), key=key, in_calls=True)
 
 
 def measure(question: Question, store: Store, gate: Gate) -> GapProblem:
@@ -295,8 +295,8 @@ def conclude(
     refuted = route.refuted(problem, gap) or (contradiction.by_audit(problem, audited.z, audited.r) if record is None else None)
     moved = partial(ledger.enter, question.identity, "hidden state", f"{gap_digest(gap, problem)}:{store.key}")
     gate = hidden_state.attacked(gate, gap, problem, model, moved, store.emit)
-    whole, fresh = Residual(store.residual.backend, model), audited.entry.draws(problem.seed, "attack")
-    attacked = attack(gap, whole, problem.domain, request.attack, fresh, store.emit) if request.attack else {}
+    fresh = audited.entry.draws(problem.seed, "attack")
+    attacked = attack(gap, store.residual, problem.domain, request.attack, fresh, store.emit) if request.attack else {}
     if record is not None and attacked:
         attacked["allowed"] = record.allowed(request.attack, request.epsilon)
     rests = route.sentences(Findings(problem, gap, record, audited, model, gate, refuted))

@@ -6,8 +6,6 @@ The gates ask few rows; that a measurement's many, in calls of thousands, got th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import final
 
 import numpy as np
 
@@ -15,27 +13,20 @@ from gapcert.certification.gates.purity import agreed, allowed
 from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.gaps.lipschitz import Residual
 from gapcert.contracts.systems.domain import Domain
-from gapcert.contracts.systems.system import Model, System, difference
+from gapcert.contracts.systems.system import System, difference
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.errors import UsageError
 
 
-@final
-@dataclass(frozen=True)
-class InCalls:
+def in_calls(residual: Residual, z: Array) -> Array:
     """r(z), of which f̂ is asked half in calls of 1, 2, …, 64, 1, … rows, a quarter in growing ones, and the rest in one."""
-
-    backend: System
-    model: Model
-
-    def __call__(self, z: Array) -> Array:
-        x, u = np.ascontiguousarray(z[:, : self.model.nx]), np.ascontiguousarray(z[:, self.model.nx :])
-        small = np.cumsum(np.resize(np.arange(1, THRESHOLDS.small_call + 1), len(z)))
-        small = small[small <= min(len(z) // 2, THRESHOLDS.small_calls_rows)]
-        grown = small[-1:] + np.cumsum(THRESHOLDS.small_call * 1.4 ** np.arange(1, 40)).astype(int)
-        each = np.split(np.arange(len(z)), [*small, *grown[grown <= small[-1:] + len(z) // 4]])
-        after = np.concatenate([self.backend.step(x[rows], u[rows]).x for rows in each])
-        return difference(self.model.states, after, self.model.step(x, u).x)
+    small = np.cumsum(np.resize(np.arange(1, THRESHOLDS.small_call + 1), len(z)))
+    small = small[small <= min(len(z) // 2, THRESHOLDS.small_calls_rows)]
+    grown = small[-1:] + np.cumsum(THRESHOLDS.small_call * 1.4 ** np.arange(1, 40)).astype(int)
+    cuts, (x, u) = [*small, *grown[grown <= small[-1:] + len(z) // 4]], (z[:, : residual.model.nx], z[:, residual.model.nx :])
+    x, u = np.ascontiguousarray(x), np.ascontiguousarray(u)
+    after = [residual.backend.step(x[rows], u[rows]).x for rows in np.split(np.arange(len(z)), cuts)]
+    return difference(residual.model.states, np.concatenate(after), residual.model.step(x, u).x)
 
 
 def again(measured: Sequence[tuple[Residual, Array, Array]], domain: Domain, e: Array, seed: int) -> str:

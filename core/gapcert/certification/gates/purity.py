@@ -90,11 +90,9 @@ def purity(
     d = 0.0
     for what, index, answer in itertools.chain(contexts(system, rows, seed), [copied], held(system, rows, first)):
         d = max(d, _same(role, system, rows, first, index, answer, what))
-        tell(what)
-    said, there = (
-        "repeated and permuted queries, close neighbours, other sizes of call",
-        _elsewhere(system, rows, executor, seed),
-    )
+        if len(answer.x) >= THRESHOLDS.purity_rows:
+            tell(what)
+    said, there = "repeated and permuted queries, close neighbours, other sizes of call", _elsewhere(system, rows, executor, seed)
     if isinstance(there, str):
         return f"{said} and a fresh copy {agreed(d)} ({there})"
     for index, answer in there:
