@@ -81,6 +81,7 @@ def test_rows_outside_are_nan_and_named_and_the_others_as_if_asked_alone(seed: i
                 ask(x, u)
 
 
+@pytest.mark.run
 def test_one_point_is_asked_as_rows_are_and_a_stored_certificate_answers_the_same(tmp_path: Path) -> None:
     model = {"kind": "equations", "states": {"v": "1"}, "inputs": {"u": "1"}, "period": "0.1 s"}
     spec = {

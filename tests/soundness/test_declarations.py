@@ -104,6 +104,26 @@ def test_true_declarations_are_accepted(seed: int) -> None:
 
 
 @pytest.mark.parametrize(
+    "law",
+    [
+        "0.4*max(0, 1 - 9000*(abs(x0 - 1.234) + abs(x1 + 0.777)))",
+        "0.2*exp(-3e6*((x0 - 0.31)**2 + (x1 - 2.2)**2 + (x2 + 1.1)**2))",
+        "0.3*tanh(4000*(u*x0 - 0.37))",
+        "0.09*sqrt(abs(x0 - 0.555))",
+    ],
+)
+def test_what_is_narrow_along_several_axes_at_once_is_found(law: str) -> None:
+    problem = asked(law, 3)
+    for lie in (
+        lambda: declared(problem, dict.fromkeys(range(4), 0.06)),
+        lambda: contradiction.symmetric(problem, Symmetry(("x0",), (0,), 0, (0.0,) * 3)),
+        lambda: stated(problem, 0.1, 1e-9),
+    ):
+        with pytest.raises(gc.UsageError, match="and the declaration allows"):
+            lie()
+
+
+@pytest.mark.parametrize(
     ("law", "bend", "true"),
     [
         ("0.01*x0**2 + 0.0003*sin(60*(x0 - 1))*exp(-(40*(x0 - 1))**2)", 0.05, False),

@@ -363,7 +363,7 @@ def test_a_target_behind_a_wall_is_told_after_all_else_was_tried() -> None:
     axes = cart(1.0).states
     stay = Box(axes, (0.4, -1.0), (2.4, 1.0))
     far, wall = (Region((Box(axes, low, high),)) for low, high in (((2.1, -1.0), (2.4, 1.0)), ((1.4, -1.0), (2.1, 1.0))))
-    told = weak(1.0, -0.3, 0.3, Goal("reach_avoid", stay, far, wall), Band((-1e-4, -1e-3), (1e-4, 1e-3)), cells=40)
+    told = weak(1.0, -0.3, 0.3, Goal("reach_avoid", stay, far, wall), Band((-1e-4, -1e-3), (1e-4, 1e-3)), cells=20)
     assert told["reason"].startswith("nothing beyond the target: ")
     assert "for γ = 0 nothing wins either, with these cells and inputs" in told["reason"]
     assert told["reason"].endswith("; neither do more cells help, nor inputs 33 times as wide")

@@ -90,7 +90,7 @@ def _held(asked: LipschitzProblem, zone: Zone, axes: Sequence[int], order: int, 
             centre = Interval.exact(boxes.mid)
             moved = (known * (boxes - centre).reshape(len(boxes), 1, -1)).sum(-1)
             known = (fhat.enclosure(centre) - f.enclosure(centre) - p.over(centre) + moved).reshape(len(boxes), -1, 1)
-        return ((known[:, :, each] if order == 1 else known).mag - enough).reshape(len(boxes), -1)
+        return np.asarray(((known[:, :, each] if order == 1 else known).mag - enough).reshape(len(boxes), -1))
 
     def look(z: Array, column: Ints) -> None:
         i, j, halves = column // len(each), each[column % len(each)], 0.5 ** np.arange(THRESHOLDS.hunt_steps)
@@ -104,12 +104,12 @@ def _held(asked: LipschitzProblem, zone: Zone, axes: Sequence[int], order: int, 
         found = np.abs(total)[np.arange(len(z)), :, i]
         allowed = most[i, j][:, None] * np.abs(t) ** order * (1 + _SPARE) + 4 * min(order, 1) * e[i][:, None]
         if (over := np.where(inside, found - allowed, -1.0)).max(initial=0.0) > 0:
-            k, s = np.unravel_index(int(np.argmax(over)), over.shape)
+            k, m = np.unravel_index(int(np.argmax(over)), over.shape)
             names = [a.name for a in asked.domain.axes]
-            step = f", within {abs(t[k, s]):.6g} along {names[j[k]]}" if order else ""
+            step = f", within {abs(t[k, m]):.6g} along {names[j[k]]}" if order else ""
             raise UsageError(
-                f"{where}: {_FOUND[order]} of {names[i[k]]} is {found[k, s]:.6g} at (x, u) = {z[k].tolist()}{step}, and the "
-                f"declaration allows {allowed[k, s]:.6g}; declare what holds, or mend the system"
+                f"{where}: {_FOUND[order]} of {names[i[k]]} is {found[k, m]:.6g} at (x, u) = {z[k].tolist()}{step}, and the "
+                f"declaration allows {allowed[k, m]:.6g}; declare what holds, or mend the system"
             )
 
     return hunt(zone, excess, look)
