@@ -105,7 +105,7 @@ class Term:
 
     def is_number(self, value: float) -> bool:
         """Is it this constant, exactly?"""
-        op, args, data = self.tape.code[self.at]
+        op, _, data = self.tape.code[self.at]
         return op == "number" and data == (value, value)
 
     @property

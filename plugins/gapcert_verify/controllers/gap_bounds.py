@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from types import SimpleNamespace
-from typing import Any, cast, final
+from typing import final
 
 import numpy as np
 
-from gapcert.plugin import Array, Coordinates, Interval, StateSpec, UsageError, ranges, rounding
+from gapcert.plugin import Array, Interval, UsageError, ranges, rounding
 from gapcert_verify import arithmetic as ar
-from gapcert_verify.evaluator import Equations
+from gapcert_verify.evaluator import Equations, Reader, Tape
 from gapcert_verify.evidence import Evidence, Part, bounds, factor, written
 from gapcert_verify.multilinear import curvature, nodes
 
@@ -30,7 +29,7 @@ class Gap:
     """
 
     evidence: Evidence
-    relative: Coordinates | None = None
+    relative: Relative | None = None
     extended: Equations | None = None
     nominal: Equations | None = None
 
@@ -53,10 +52,7 @@ class Gap:
 
     def at(self, z: Array) -> tuple[Interval, Interval]:
         """(l, u) at points (x, u), each as an interval around the exact value."""
-        if self.relative is None:
-            return bounds(self.evidence, z, "")
-        low, high = bounds(self.evidence, self.relative.over(Interval.exact(z)).mid, "")
-        return low, high
+        return bounds(self.evidence, z if self.relative is None else self.relative.over(Interval.exact(z)).mid, "")
 
     @cached_property
     def slopes(self) -> Array | None:
@@ -71,7 +67,7 @@ class Gap:
         slope = constants + (np.abs(e.arrays["predictor.slope"]) if kind == "affine" else 0.0)
         if (c := self.relative) is None:
             return np.asarray(slope)
-        x, w = slope[:, : len(c.slope[0])], slope[:, len(c.slope[0]) :]
+        x, w = slope[:, : c.slope.shape[1]], slope[:, c.slope.shape[1] :]
         return np.concatenate([x + w @ np.abs(c.slope), w * np.abs(c.scale)], axis=1)
 
     def _over(self, boxes: Interval, asked: Interval) -> Interval:
@@ -115,17 +111,41 @@ class Gap:
         return Interval.exact(np.zeros((n, nx)))
 
 
-def coordinates(section: Mapping[str, Any], given: Mapping[str, str] | None) -> Coordinates | None:
-    """Those of a spec whose inputs are measured relative to the states."""
+@final
+@dataclass(frozen=True)
+class Relative:
+    """w = scale · u + slope x, one row per input: slope (nu, nx), scale (nu,) without a zero."""
+
+    slope: Array
+    scale: Array
+
+    def over(self, z: Interval) -> Interval:
+        """Boxes of (x, u) → boxes that contain (x, w), (n, nz)."""
+        nx = self.slope.shape[1]
+        w = (z[:, None, :nx] * self.slope).sum(-1) + z[:, nx:] * Interval.exact(self.scale)
+        return Interval.concatenate([z[:, :nx], w], axis=1)
+
+
+def coordinates(model: Equations, given: Mapping[str, str] | None) -> Relative | None:
+    """Of a spec whose inputs are measured relative to the states: texts such as `{d: u - v}`. ValueError for others."""
     if not given:
         return None
-    named = (
-        tuple(StateSpec(n, a if isinstance(a, str) else a.get("unit", "1")) for n, a in (section.get(part) or {}).items())
-        for part in ("states", "inputs")
-    )
-    states, inputs = named
-    system: Any = SimpleNamespace(states=states, inputs=inputs, nx=len(states))
-    return Coordinates.of(cast("Any", system), given)
+    tape, names = Tape(), (*model.states, *model.inputs)
+    read = Reader(tape, {n: tape.column(j) for j, n in enumerate(names)})
+    one, wide = ar.point(1.0), frozenset(range(len(names)))
+    rows = np.zeros((len(given), len(names)))
+    for text, slopes in zip(
+        given.values(), tape.run([one] * len(names), [read(t) for t in given.values()], wide)[1], strict=True
+    ):
+        for j, s in slopes.items():
+            own = [r for r in range(len(model.inputs)) if model.nx + r in slopes]
+            if len(own) != 1 or s.lo != s.hi:
+                raise ValueError(f"'{text}' is no sum of one input and of states")
+            rows[own[0], j] = s.lo
+    scale = np.diagonal(rows[:, model.nx :])
+    if not scale.all():
+        raise ValueError("the coordinates do not stand for the inputs")
+    return Relative(rows[:, : model.nx], scale)
 
 
 def _envelope(e: Evidence, boxes: Interval) -> Interval:

@@ -27,8 +27,8 @@ CORNER = 0.999  # of the way from the middle of a cell to a corner, where a step
 @final
 @dataclass(frozen=True)
 class Proof:
-    """cells, their parts to be proved, and, in (x, u), the domain that the gap is known in. flow: None takes the successors that
-    the controller has stored.
+    """cells, their parts to be proved, and, in (x, u), the domain that the gap is known in. flow: None takes the successors
+    that the controller has stored.
 
     tick: told how many of how many cells are done; begin: so many need not be looked at again.
     """

@@ -10,31 +10,28 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, cast, final
 
 import numpy as np
 
 from gapcert.plugin import (
     DAMAGE,
-    Array,
     Box,
     Emit,
-    GapcertError,
     Pulse,
     Relation,
+    StateSpec,
+    UsageError,
     Zone,
     __version__,
-    load_spec,
-    magnitude,
     write_atomic,
 )
 from gapcert_cells import GROWTH, SEEN, AutomatonController, GridController, saved_data
-from gapcert_verify.evaluator import Equations, NotText
+from gapcert_verify.evaluator import Equations, NotText, quantity
 from gapcert_verify.evidence import Evidence
 
+from .asked import Asked
 from .cells import Cells
 from .games import figures, parts
 from .gap_bounds import Gap, coordinates
@@ -77,17 +74,27 @@ class Saved:
             f"{said}, are as the controller states.",
             "The controller without γ promises nothing of f̂: it was not looked at.",
         ]
+        with suppress(UsageError, *DAMAGE):  # of what cannot be read, the checks say so
+            out += self._taken
+        return out
+
+    @property
+    def _taken(self) -> list[str]:
+        """What is not text, or not there, and what a person declares."""
+        out, asked = list[str](), self._asked_for
         if isinstance(self._flow, str):
-            what = "was not proved again" if self.controller.successors is None else "is proved from the cells that are stored"
+            what = (
+                "was not proved again" if self.controller.successors is None else "is proved from the successors it has stored"
+            )
             out.append(f"The controller's promise {what}: {self._flow} was not bounded.")
         elif self._flow.growth is not None:
             given = self._section["growth"]["model"]
             told = "; ".join(f"{n}: {t}" for n, t in self._growth_section.get("next", {}).items()) or "integrated"
             out.append(f"Successors of cells spread as the growth bound {given} declares ({told}).")
-        if isinstance(self._spec, str):
-            out.append(
-                f"The goal, the cells and the inputs are those that were asked for: the spec cannot be read ({self._spec})."
-            )
+        if isinstance(asked, str):
+            out.append(f"Goal, cells and inputs of the controller are those that were asked for: of a spec, {asked}.")
+        elif asked.cuts:
+            out.append("The inequalities of the goal's polytopes do what their texts say.")
         return out
 
     @cached_property
@@ -127,20 +134,17 @@ class Saved:
         return cast("Mapping[str, Any]", self.stored.get("controller") or {})
 
     @cached_property
-    def _spec(self) -> Any:
-        """The parts of the spec that the controller is made from, checked; or why not."""
+    def _asked_for(self) -> Asked | str:
+        """What the spec asks of it; or why that is not known."""
+        zone, axes = self.evidence.zone, tuple(StateSpec(*a) for a in self.data["goal"]["axes"])
         if not self._section:
             return "there is none"
-        kept = ("version", "name", "model", "domain", "relations", "controller")
-        asked = {k: self.stored[k] for k in kept if k in self.stored}
-        states = [str(a[0]) for a in self.data["goal"]["axes"]]
+        asked = Asked(self.stored, Box(axes, zone.low[: len(axes)], zone.high[: len(axes)]), self.home)
         try:
-            return load_spec({**asked, "gap": {"kind": "declared", "gamma": dict.fromkeys(states, 0.0)}}, folder=self.home)
-        except (GapcertError, *DAMAGE):
-            try:
-                return load_spec(self.stored, folder=self.home)
-            except (GapcertError, *DAMAGE) as error:
-                return str(error).splitlines()[0]
+            _ = asked.goal
+        except OSError as error:
+            return f"{error.filename}: {error.strerror}"
+        return asked
 
     @cached_property
     def _model(self) -> Equations | str:
@@ -157,7 +161,19 @@ class Saved:
 
     @cached_property
     def _growth_section(self) -> Mapping[str, Any]:
-        return cast("Mapping[str, Any]", load_spec(self.home / self._section["growth"]["model"]).data["model"])
+        return self._elsewhere(self._section["growth"]["model"])
+
+    def _elsewhere(self, path: str) -> Mapping[str, Any]:
+        """The model of another spec."""
+        from ruamel.yaml import YAML
+
+        try:
+            found = YAML(typ="safe", pure=True).load((self.home / path).read_text(encoding="utf-8"))
+        except OSError as error:
+            raise NotText(f"{path}, which cannot be read ({error.strerror}),") from None
+        if not isinstance(found, dict) or not isinstance(found.get("model"), dict):
+            raise NotText(f"{path}, which states no model itself,")
+        return cast("Mapping[str, Any]", found["model"])
 
     @cached_property
     def _flow(self) -> Flow | str:
@@ -169,20 +185,19 @@ class Saved:
             if self._section.get("growth"):
                 error = np.zeros(model.nx)
                 for name, value in (self._section.get("error") or {}).items():
-                    j = model.states.index(name)
-                    error[j] = magnitude(value, self.controller.goal.stay.axes[j].unit)
+                    error[model.states.index(name)] = quantity(value)[1]
                 growth = Growth(Equations.of(self._growth_section), error)
             extended = self._extended()
         except NotText as error_:
             return str(error_)
-        relative = coordinates(self.stored["model"], self.stored.get("coordinates"))
+        relative = coordinates(model, self.stored.get("coordinates"))
         return Flow(model, Gap(self.evidence, relative, extended, model), growth, points)
 
     def _extended(self) -> Equations | None:
         """The model that the certificate's predictor is the step of, less that of the run's model."""
         if self.evidence.data["predictor"] != "model":
             return None
-        return Equations.of(load_spec(self.home / self.stored["gap"]["predictor"]["model"]).data["model"])
+        return Equations.of(self._elsewhere(self.stored["gap"]["predictor"]["model"]))
 
     def _certified(self) -> str:
         """It names this certificate as the one behind its promise."""
@@ -214,7 +229,8 @@ class Saved:
             return "its goal reaches beyond the domain of the certificate"
         if text := self._evidence():
             return text
-        return None if isinstance(self._spec, str) else self._of_spec()
+        asked = self._asked_for
+        return None if isinstance(asked, str) else asked.differs(self.controller, str(self.data.get("kind")))
 
     def _evidence(self) -> str:
         """What `evidence` says of cells is so, and what it rests on is named."""
@@ -232,61 +248,6 @@ class Saved:
             return f"it rests on {allowed[0] or 'no assumption'}, and states {said.get('assumptions')}"
         return ""
 
-    def _of_spec(self) -> str:
-        c, spec = self.controller, self._spec
-        box = Box(
-            c.goal.stay.axes, self.evidence.zone.low[: len(c.goal.stay.axes)], self.evidence.zone.high[: len(c.goal.stay.axes)]
-        )
-        if spec.goal(cast("Any", SimpleNamespace(states=box))) != self.loaded.goal:
-            return "its goal is not that of the spec"
-        if spec.config.controller.kind != self.data.get("kind"):
-            return f"it is said to be made by '{self.data.get('kind')}', and the spec asks for '{spec.config.controller.kind}'"
-        return self._gridded(spec) if spec.config.controller.kind == "symbolic" else ""
-
-    def _gridded(self, spec: Any) -> str:
-        """Edges and inputs are those that the options of `symbolic` give."""
-        given, c = self._section, self.controller
-        names, inputs = c.goal.stay.names, list(self.stored["model"].get("inputs", {}))
-        units = {n: a if isinstance(a, str) else a.get("unit", "1") for n, a in self.stored["model"].get("inputs", {}).items()}
-        ranges = {n: spec.config.domain[n] for n in inputs} | {
-            n: tuple(magnitude(v, units[n]) for v in ends) for n, ends in (given.get("input_range") or {}).items()
-        }
-        wanted = given.get("on") or list(names)
-        if sorted(wanted) != sorted(names[j] for j in c.on):
-            return f"it has cells for {', '.join(names[j] for j in c.on)}, and the spec asks for {', '.join(wanted)}"
-        if given.get("align") == "scots":
-            eta = {
-                n: magnitude(v, dict(zip(names, (a.unit for a in c.goal.stay.axes), strict=True)).get(n, units.get(n, "1")))
-                for n, v in given["eta"].items()
-            }
-            return self._scots(eta, ranges)
-        halvings = 0 if c.splits is None else c.splits.levels
-        if halvings > given.get("refine", 0):
-            return f"its cells are halved {halvings} times, and the spec asks for {given.get('refine', 0)}"
-        for j, edges in zip(c.on, c.edges, strict=True):
-            own = np.linspace(c.goal.stay.low[j], c.goal.stay.high[j], (int(given["cells"][names[j]]) << halvings) + 1)
-            if not np.array_equal(own, edges):
-                return f"the cells of {names[j]} are not the {given['cells'][names[j]]} that tile the goal's box"
-        values = [np.linspace(*ranges[n], int(given["inputs"][n])) for n in inputs]
-        return self._offered(list(product(*values)), 1e-12 * np.array([b - a for a, b in ranges.values()]))
-
-    def _offered(self, points: Any, spare: Array) -> str:
-        wanted, found = np.array(points), self.controller.points
-        same = wanted.shape == found.shape and (np.abs(wanted - found) <= spare).all()
-        return "" if same else f"its {len(found)} inputs are not the {len(wanted)} of the spec"
-
-    def _scots(self, eta: Mapping[str, float], ranges: Mapping[str, tuple[float, ...]]) -> str:
-        c, names = self.controller, self.controller.goal.stay.names
-        for name, edges in zip(names, c.edges, strict=True):
-            at = (edges[:-1] + edges[1:]) / 2 / eta[name]
-            if np.abs(at - np.round(at)).max() > 1e-6 or np.abs(np.diff(edges) / eta[name] - 1).max() > 1e-6:
-                return f"the cells of {name} do not lie at multiples of {eta[name]:g}"
-        values = []
-        for name, (low, high) in ranges.items():
-            first, last = np.ceil(low / eta[name] - 1e-6), np.floor(high / eta[name] + 1e-6)
-            values.append(eta[name] * np.arange(first, last + 1))
-        return self._offered(list(product(*values)), 1e-9 * np.array([eta[n] for n in ranges]))
-
     def _proved(self) -> str | None:
         flow, c = self._flow, self.controller
         if isinstance(flow, str):
@@ -294,9 +255,9 @@ class Saved:
         zone = self.evidence.zone
         u = np.asarray(c.points)
         nx = len(c.goal.stay.axes)
-        if flow.gap is None or flow.gap.relative is None:
-            if not ((u >= zone.low[nx:]) & (u <= zone.high[nx:])).all():
-                return f"inputs between {u.min(axis=0).tolist()} and {u.max(axis=0).tolist()} reach beyond the certificate's domain"
+        inside = ((u >= zone.low[nx:]) & (u <= zone.high[nx:])).all()
+        if (flow.gap is None or flow.gap.relative is None) and not inside:
+            return f"inputs from {u.min(axis=0).tolist()} to {u.max(axis=0).tolist()} are beyond the certificate's domain"
         return self._run(flow)
 
     @property
@@ -306,7 +267,7 @@ class Saved:
         relative = flow.gap.relative if isinstance(flow, Flow) and flow.gap is not None else None
         if relative is None:
             return zone
-        c, d, nx = np.asarray(relative.slope), np.asarray(relative.scale), len(relative.slope[0])
+        c, d, nx = relative.slope, relative.scale, relative.slope.shape[1]
         moved = [
             Relation(r.text, tuple((np.concatenate([a[:nx] + a[nx:] @ c, a[nx:] * d])).tolist()), r.bound)
             for r, a in zip(zone.relations, zone.matrix, strict=True)
@@ -331,7 +292,12 @@ def controlled(e: Evidence, emit: Emit) -> Saved | None:
     """The controller of a run that knows γ; None where there is none."""
     places = e.folder / "controller" / "with_gamma", e.folder / "controller"
     folder = next((p for p in places if (p / "controller.json").is_file()), None)
-    return None if folder is None else Saved(e, folder, saved_data(folder), emit)
+    if folder is None:
+        return None
+    data: Mapping[str, Any] = {}
+    with suppress(UsageError):  # the checks say what is missing
+        data = saved_data(folder)
+    return Saved(e, folder, data, emit)
 
 
 @final
