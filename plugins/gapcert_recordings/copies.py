@@ -120,7 +120,8 @@ class _Series:
     @property
     def coarse(self) -> float:
         """How much of each value its digits leave open, on the whole."""
-        return float(np.mean(self.quantum / np.maximum(np.nanmax(np.abs(self.values), axis=0), np.finfo(np.float64).tiny)))
+        size = np.broadcast_to(np.nanmax(np.abs(self.values), axis=0), self.quantum.shape)
+        return float(np.mean(np.divide(self.quantum, size, out=np.zeros(size.shape), where=size > 0)))
 
     @cached_property
     def moves(self) -> Bools:

@@ -110,6 +110,21 @@ class Remembers(Faulty):
         return Step(out.x + (0.0 if last in (None, self.last) else 1e-15), out.hidden)
 
 
+class Sleeps(Faulty):
+    """Whatever is close to the row before it, and is not that, hardly moves."""
+
+    def _step(self, x, u, **options):
+        out = super()._step(x, u, **options)
+        away = np.abs(np.diff(x, axis=0, prepend=x[:1] + 1)).max(axis=1, keepdims=True)
+        return Step(out.x + 1e-13 * ((away > 0) & (away < 1e-3)), out.hidden)
+
+
+class Sulks(Faulty):
+    def _step(self, x, u, **options):
+        out, self.far = super()._step(x, u, **options), getattr(self, "far", False) or bool((np.abs(x) > 100).any())
+        return Step(out.x + 1e-13 * self.far, out.hidden)
+
+
 class WarmStart(Faulty):
     def _step(self, x, u, **options):
         out = super()._step(x, u, **options)
@@ -262,6 +277,8 @@ FAULTS = [
     (Remembers, "test_repeats_bit_for_bit"),
     (WarmStart, "test_order_does_not_matter"),
     (SumsBatch, "test_batch_equals_singles"),
+    (Sleeps, "test_company_does_not_matter"),
+    (Sulks, "test_failures_leave_no_trace"),
     (Draws, "test_fresh_instance_gives_the_same_bits"),
     (elsewhere, "test_another_process_gives_the_same_bits"),
     (EmptyFails, "test_empty_batch"),
