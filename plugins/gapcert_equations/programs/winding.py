@@ -47,10 +47,10 @@ class Winding:
     __radd__ = __add__
 
     def __sub__(self, other: Any) -> Winding:
-        return self + -other
+        return self.__add__(-other)
 
     def __rsub__(self, other: Any) -> Winding:
-        return -self + other
+        return (-self).__add__(other)
 
     def __mul__(self, other: Any) -> Winding:
         if not isinstance(other, Winding):
