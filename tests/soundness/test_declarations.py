@@ -15,6 +15,7 @@ from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.gaps.gap import GapProblem
 from gapcert.contracts.gaps.lipschitz import LipschitzBound, LipschitzProblem, Residual, Symmetry
 from gapcert.contracts.gaps.predictor import AffinePredictor, Samples
+from gapcert.numerics.order_statistics import NO_CONSTANTS
 from gapcert.testing.toys import Opaque
 from gapcert_bounds.constants.declared_constants import Declared
 from gapcert_bounds.families.constant import Declared as DeclaredGamma
@@ -43,6 +44,14 @@ def asked(law: str, n: int) -> LipschitzProblem:
     return LipschitzProblem(domain, none, residual.resolution(domain), lambda _, z: residual(z), f, fhat, seed=5)
 
 
+def held(problem: LipschitzProblem, bound: LipschitzBound, gap: Any = None) -> None:
+    """A bound, or a γ that is assumed, against the equations."""
+    n = problem.domain.nx
+    samples = Samples(np.zeros((0, n + 1)), np.zeros((0, n)))
+    whole = GapProblem(samples, problem.domain, bound, problem.predictor, problem.resolution, "dominate")
+    contradiction.declared(whole, gap, Residual(problem.backend, problem.model), gap is not None)
+
+
 def declared(problem: LipschitzProblem, slope: Mapping[int, float], bend: Mapping[int, float] | None = None) -> None:
     """Held against the equations: constants of x0 by axis, others 0, and, if given, curvature."""
     names = [a.name for a in problem.domain.axes]
@@ -51,18 +60,14 @@ def declared(problem: LipschitzProblem, slope: Mapping[int, float], bend: Mappin
     def table(of: Mapping[int, float]) -> dict[str, dict[str, float]]:
         return {s: {a: of.get(j, 0.0) if s == "x0" else 0.0 for j, a in enumerate(names)} for s in state}
 
-    bound = Declared(table(slope), None if bend is None else table(bend)).bound(problem)
-    contradiction.constants(problem, bound)
+    held(problem, Declared(table(slope), None if bend is None else table(bend)).bound(problem))
 
 
 def stated(problem: LipschitzProblem, first: float, others: float) -> None:
     """Held against the equations: γ of x0, and of the other states."""
     names, n = [s.name for s in problem.model.states], problem.domain.nx
     gap = DeclaredGamma({name: first if name == "x0" else others for name in names}).stated(names)
-    bound = LipschitzBound(np.zeros((n, n + 1)), np.zeros((n, n + 1)), "declared", "")
-    samples = Samples(np.zeros((0, n + 1)), np.zeros((0, n)))
-    whole = GapProblem(samples, problem.domain, bound, problem.predictor, problem.resolution, "declared")
-    contradiction.gamma(whole, gap, Residual(problem.backend, problem.model))
+    held(problem, LipschitzBound(np.zeros((n, n + 1)), np.zeros((n, n + 1)), "estimated", NO_CONSTANTS), gap)
 
 
 def drawn(seed: int) -> tuple[str, int, int, float, float]:
@@ -149,10 +154,10 @@ def test_a_bend_is_judged_by_its_slab() -> None:
         parts = {"x0": {"x0": [[-2.0, 1.0, quiet], [1.0, 3.0, loud]], "u": 0.0}}
         bound = Declared({"x0": {"x0": 0.05, "u": 0.0}}, parts).bound(problem)
         if true:
-            contradiction.constants(problem, bound)
+            held(problem, bound)
         else:
             with pytest.raises(gc.UsageError, match="lipschitz: curvature"):
-                contradiction.constants(problem, bound)
+                held(problem, bound)
 
 
 def test_a_ripple_below_the_resolution_is_no_contradiction() -> None:
@@ -173,10 +178,10 @@ def test_without_the_search_the_lie_stands(monkeypatch: pytest.MonkeyPatch) -> N
 def test_what_encloses_nothing_stays_an_assumption() -> None:
     problem = asked("0.01*sin(x0)", 2)
     for other in (Opaque(problem.backend), gc.testing.toys.Perturbed(problem.model, lambda z: 0 * z[:, :2])):
-        held = contradiction.symmetric(replace(problem, backend=other), Symmetry(("x1",), (1,), 3, (0.0, 0.0)))
-        assert not held.proved
-        assert "nothing proves it" in held.sentence()
-        assert held.exception.endswith("along x1, which rest on the declared symmetry")
+        kept = contradiction.symmetric(replace(problem, backend=other), Symmetry(("x1",), (1,), 3, (0.0, 0.0)))
+        assert not kept.proved
+        assert "nothing proves it" in kept.sentence()
+        assert kept.exception.endswith("along x1, which rest on the declared symmetry")
 
 
 def spec(law: str, **more: Any) -> dict[str, Any]:

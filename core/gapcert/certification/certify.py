@@ -174,7 +174,6 @@ def measure(question: Question, store: Store, gate: Gate) -> GapProblem:
     store.emit(Event("stage-started", "lipschitz", {}))
     asked = replace(asked, predictor=p, held=held)
     constants = watched(asked, question.lipschitz.bound(asked), samples, store.emit)
-    contradiction.constants(asked, constants)
     constants = constants if symmetry is None else symmetry.applied(constants, p, domain)
     further: Array | None
     if constants.cells is not None and question.fit.cells:
@@ -303,8 +302,8 @@ def conclude(
     drawn = f"uniform on {problem.domain.words}{gate.distribution}{'' if record is None else record.draws}"
     constant, envelope = route.yardsticks(gap, problem, record, audited.z)
     over = refuted is not None or points_refute(audited, attacked, gate)
-    if route.claim == "assumed" and not over:
-        contradiction.gamma(problem, gap, store.residual)
+    if not over:
+        contradiction.declared(problem, gap, store.residual, route.claim == "assumed")
     return Certificate(
         gap,
         problem,

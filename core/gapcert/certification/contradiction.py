@@ -14,7 +14,7 @@ import numpy as np
 from gapcert.certification.refutation import contradiction
 from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.gaps.gap import GapFunction, GapProblem
-from gapcert.contracts.gaps.lipschitz import LipschitzBound, LipschitzProblem, Residual, Symmetry
+from gapcert.contracts.gaps.lipschitz import LipschitzProblem, Residual, Symmetry
 from gapcert.contracts.gaps.predictor import AffinePredictor, Samples
 from gapcert.numerics.arrays import Array, Ints
 from gapcert.numerics.constraint_zone import Zone
@@ -121,11 +121,18 @@ def symmetric(asked: LipschitzProblem, symmetry: Symmetry) -> Symmetry:
     return replace(symmetry, proved=_held(asked, asked.domain.zone, symmetry.axes, 1, zero, "symmetries.translation"))
 
 
-def constants(asked: LipschitzProblem, bound: LipschitzBound) -> None:
-    """UsageError where equations contradict declared constants, or a declared curvature in one of its slabs."""
-    if bound.provenance != "declared" or bound.cells is not None:
+def declared(problem: GapProblem, gap: GapFunction, residual: Residual, assumed: bool) -> None:
+    """UsageError where equations contradict a declared γ (`assumed`: the largest of it), declared constants, or a declared
+    curvature in one of its slabs.
+    """
+    bound, zone, nz = problem.lipschitz, problem.domain.zone, len(problem.domain.low)
+    p = AffinePredictor.none(problem.domain.nx, nz) if assumed else problem.predictor
+    asked = LipschitzProblem(problem.domain, p, problem.resolution, lambda _, z: residual(z), residual.model, residual.backend)
+    if assumed:
+        _held(asked, zone, [0], 0, np.repeat(gap.gamma_over(problem.domain.interval).T, nz, axis=1), "gap: γ")
+    if assumed or bound.provenance != "declared" or bound.cells is not None:
         return
-    zone, axes = asked.domain.zone, [j for j in range(len(asked.domain.low)) if j not in asked.held]
+    axes = [j for j in range(nz) if problem.symmetry is None or j not in problem.symmetry.axes]
     _held(asked, zone, axes, 1, bound.value, "lipschitz: constants")
     for j in axes:
         slabs = bound.slabs and bound.slabs[j]
@@ -135,14 +142,6 @@ def constants(asked: LipschitzProblem, bound: LipschitzBound) -> None:
             if np.isfinite(most).all():
                 every = np.broadcast_to(most[:, None], bound.value.shape)
                 _held(asked, replace(zone, low=ends[0], high=ends[1]), [j], 2, every, "lipschitz: curvature")
-
-
-def gamma(problem: GapProblem, gap: GapFunction, residual: Residual) -> None:
-    """UsageError where equations lead to a point at which |f̂ − f| is larger than the largest γ that is declared."""
-    domain, top = problem.domain, gap.gamma_over(problem.domain.interval).T
-    none = AffinePredictor.none(domain.nx, len(domain.low))
-    asked = LipschitzProblem(domain, none, problem.resolution, lambda _, z: residual(z), residual.model, residual.backend)
-    _held(asked, domain.zone, [0], 0, np.repeat(top, len(domain.low), axis=1), "gap: γ")
 
 
 def by_audit(problem: GapProblem, z: Array, r: Array, most: int = 1_000) -> dict[str, Any] | None:
