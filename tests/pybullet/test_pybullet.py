@@ -168,37 +168,6 @@ class TestCart(SystemContract):
         return at_height(cart(self.folder, drive=drive), 0.13)
 
 
-CLAW = '<robot name="claw"><link name="world"/>' + "".join(
-    ROD.format(name=name, shape=BOX) + JOINT.format(name=f"hinge_{name}", type="continuous", parent="world", child=name, **at)
-    for name, at in (("left", {"at": "-0.12 0 0", "more": ""}), ("right", {"at": "0.12 0 0", "more": ""}))
-)
-
-
-def claw(tmp_path, **options):
-    """Two rods side by side, which meet where their angles cross."""
-    parts = ("left", "right")
-    states = {f"{k}_{p}": f"hinge_{p}.{k}" for p in parts for k in ("position", "velocity")}
-    more = {"states": states, "inputs": {p: f"hinge_{p}" for p in parts}, "self_collision": True, "substeps": 5}
-    return build(tmp_path, CLAW + "</robot>", **(more | options))
-
-
-@pytest.mark.parametrize("ground", [None, 0.8])
-class TestClaw(SystemContract):
-    """Rods that meet each other, above the ground or within its reach."""
-
-    @pytest.fixture(autouse=True)
-    def _folder(self, tmp_path, ground):
-        self.folder, self.ground = tmp_path, ground
-
-    def system(self):
-        return claw(self.folder, ground=self.ground)
-
-    def test_they_meet(self):
-        _, x, u, _ = self._query()
-        apart = claw(self.folder, self_collision=False)
-        assert 3 < (np.abs(self.system().step(x, u).x - apart.step(x, u).x).max(axis=1) > 1e-3).sum()
-
-
 @pytest.mark.parametrize(("friction", "mu"), [(None, 0.4), (0.25, 0.2)])
 def test_crate_slides_with_the_product_of_frictions(tmp_path, friction, mu):
     """v⁺ = v − μ g τ: Bullet multiplies the ground's coefficient by the link's (0.5 where the file says nothing)."""

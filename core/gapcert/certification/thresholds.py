@@ -39,6 +39,7 @@ class Thresholds:
     hidden_attack: int = chosen(256, "points of an attack from other hidden states, and as many visited ones")
     spread_points: int = chosen(64, "at which the spread over hidden states is measured")
     spread_draws: int = chosen(16, "hidden states at each of these")
+    repeat_rows: int = chosen(64, "points at which it is looked whether a system repeats with a turn")
     repeat_error: float = chosen(64.0, "times what a step rounds by, that it may change with a turn: sums round more than once")
     purity_rows: int = chosen(21, "that are asked again in other company; with the centre and three ladders they are 64")
     purity_rungs: int = chosen(14, "of a ladder of close rows: from its length down to 6e-7 of it")
