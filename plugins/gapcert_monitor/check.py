@@ -249,13 +249,13 @@ def check(certified: Certified, recording: Recording, noise: Mapping[str, float]
 def tolerated(claim: Claim | None, units: int) -> int:
     """With how many violations among so many units a claim still stands at its own level.
 
-    A statistical one is refuted by v where P(Bin(units, ε) ≥ v) ≤ β, or ≤ 1e-6 where it states no β, as if units were
+    A statistical one is refuted by v where P(Bin(units, ε) ≥ v) ≤ β, or ≤ 5 % where it states no β, as if units were
     independent and of its distribution. All others are about every transition.
     """
     if claim is None or claim.kind != "statistical" or claim.epsilon is None or not units:
         return 0
-    level = {} if claim.beta is None else {"level": claim.beta}
-    return order_statistics.surprising(units, claim.epsilon, **level) - 1
+    level = 1 - THRESHOLDS.confidence if claim.beta is None else claim.beta
+    return order_statistics.surprising(units, claim.epsilon, level) - 1
 
 
 def _units(certified: Certified, steps: Transitions, recording: Recording) -> Ints:

@@ -236,10 +236,10 @@ def test_tosses_of_a_cube_beside_free_fall(tmp_path: Path) -> None:
     c = done.certificate
     assert isinstance(c, gc.CalibratedRecording)
     assert (c.claim.epsilon, c.claim.beta) == (0.05, 0.01)
-    assert (c.units, len(c.held), c.rank) == (377, 252, 248)
+    assert (c.units, len(c.held), c.rank) == (364, 243, 239)  # 14 of the 379 tosses are in the data twice
     low, high = c.gap.interval(c.held.z)
     out = c.held.window[((c.held.r < low) | (c.held.r > high)).any(axis=1)]
-    assert len(np.unique(out)) == 252 - 248
+    assert len(np.unique(out)) == 243 - 239
     assert verify_run(done.folder)["verdict"] == "holds"
 
 

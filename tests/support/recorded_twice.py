@@ -25,12 +25,13 @@ def measured(form: str, command: np.ndarray, rng: np.random.Generator) -> dict[s
     if form == "encoder":  # counts of an encoder, with a noise from a tenth of a count to some
         angle, step = np.cumsum(level) * 0.2, 2 * np.pi / 4096
         return {"u": command, "x": step * np.round((angle + step * 10 ** rng.uniform(-1, 0.7) * rng.normal(size=n)) / step)}
-    if form == "exact":  # a simulation without noise, from a start of its own
-        x, out = rng.normal(), []
+    if form == "exact":  # a pendulum without friction or noise, from a start of its own
+        angle, speed, out = rng.uniform(-1, 1), rng.uniform(-1, 1), []
         for u in command:
-            out.append(x)
-            x = 0.95 * x + 0.05 * np.sin(x) + 0.1 * u
-        return {"u": command, "x": np.array(out)}
+            out.append((angle, speed))
+            speed += 0.05 * (u - np.sin(angle))
+            angle += 0.05 * speed
+        return {"u": command, "x": np.array(out)[:, 0], "v": np.array(out)[:, 1]}
     if form == "thermal":  # slow, and read in tenths
         slow = np.convolve(command, np.exp(-np.arange(200) / 60) / 6)[:n]
         return {"u": command, "x": np.round(20 + slow + 0.08 * rng.normal(size=n), 1)}

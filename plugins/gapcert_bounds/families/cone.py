@@ -27,6 +27,7 @@ class Cones:
     def __init__(self, z: Array, g: Array, lipschitz: Array) -> None:
         self._z, self._g, self._lipschitz = np.ascontiguousarray(z.T), np.ascontiguousarray(g.T), lipschitz
         self._largest, self._columns = np.abs(g).max(axis=0), list(np.ascontiguousarray(lipschitz.T)[:, :, None])
+        self._signed = np.stack([self._g, -self._g])
 
     def __call__(self, z: Array) -> tuple[Array, Array]:
         n, nx = len(z), len(self._g)
@@ -48,7 +49,9 @@ class Cones:
         total = self._columns[0] * away[0]
         for column, part in zip(self._columns[1:], away[1:], strict=True):
             total += column * part
-        return np.maximum.reduce(self._g - total, axis=1), np.minimum.reduce(self._g + total, axis=1)
+        # max g − t = −min (−g + t), without a rounding of its own.
+        upper, lower = np.minimum.reduce(self._signed + total, axis=2)
+        return -lower, upper
 
     def lowest(self, i: int, sign: int, z: Array) -> Ints:
         """(n,): the number of a cone of sign · g that is smallest at each point z (n, nz)."""
