@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -146,6 +146,39 @@ KINDS: Mapping[str, Kind] = {
 """Where a row's answer is off (True: by `size`), or by how much, in units of it."""
 
 
+def drawn(seed: int) -> Kind:
+    """A kind of its own for every seed: one circumstance with drawn numbers, on all of Z or in a slit."""
+    rng = np.random.default_rng([seed, 0xBAD])
+    few, many, period = (int(10 ** rng.uniform(a, b)) for a, b in ((0, 1.8), (1.9, 3.7), (0.4, 2.0)))
+    scale, share, phase = 10 ** rng.uniform(-6, -0.5), float(rng.choice([1.0, 1.0, 0.3, 0.05, 0.01])), int(rng.integers(period))
+    columns = (slice(None), slice(0, 2), slice(2, 3))[rng.integers(3)]
+    laws: Sequence[Kind] = (
+        lambda z, c: np.full(len(z), c.n <= few),
+        lambda z, c: np.full(len(z), c.n >= many),
+        lambda z, c: np.full(len(z), c.n % period == phase),
+        lambda z, c: c.index >= few,
+        lambda z, c: c.index >= many,
+        lambda z, c: c.index % period == phase,
+        lambda z, c: np.full(len(z), c.calls >= few),
+        lambda z, c: np.full(len(z), c.calls % period == phase),
+        lambda z, c: c.rows >= many,
+        lambda z, c: c.rows % period == phase,
+        lambda z, c: _near(z, c.before, 0.0, scale, columns),
+        lambda z, c: _near(z, c.after, 0.0, scale, columns),
+        lambda z, c: c.total > many / 4,
+        lambda z, c: scale * np.nan_to_num(c.before[:, 0]),
+        lambda z, c: scale * (c.mean[:, 0] - z[:, 0]),
+        lambda z, c: c.repeated >= few,
+    )
+    law = laws[rng.integers(len(laws))]
+    return lambda z, c: law(z, c) * (share == 1.0 or _slit(z, share))
+
+
+def kind_of(name: str) -> Kind:
+    """Of the table, or `drawn SEED`."""
+    return KINDS[name] if name in KINDS else drawn(int(name.removeprefix("drawn ")))
+
+
 @final
 class Circumstantial(gc.Backend):
     """x⁺ = f(x, u) + small waves + size · kind(z, circumstances); the clean twin sees the circumstances of a row alone."""
@@ -174,7 +207,7 @@ class Circumstantial(gc.Backend):
             self.failed = True
             raise ArithmeticError("no convergence")
         c = Circumstances.alone(z) if self.clean else self._circumstances(z, x)
-        return self.law(z) + self.size * np.asarray(KINDS[self.kind](z, c), dtype=float)[:, None]
+        return self.law(z) + self.size * np.asarray(kind_of(self.kind)(z, c), dtype=float)[:, None]
 
     def _circumstances(self, z: Array, x: Array) -> Circumstances:
         n, before = len(z), np.vstack([self.last, z[:-1]])

@@ -28,6 +28,7 @@ from gapcert.certification.gates.augment import widen
 from gapcert.certification.gates.circle import repeating
 from gapcert.certification.gates.hidden_state import Gate, HiddenPlan
 from gapcert.certification.ledger import Ledger
+from gapcert.certification.gates.purity import unchanged
 from gapcert.certification.refutation import watched
 from gapcert.certification.routes import Findings, Request, Route
 from gapcert.certification.samples.designs import AdaptiveSampling, GridSampling, LatticeSampling, Sampling, axes_of, refined
@@ -111,6 +112,7 @@ def certify(
         audited = audit(gap, problem, asked, strong, book, record)  # attacked at points that no fit has seen
     told = ((store.residual, problem.samples.z, problem.samples.r), (strong.residual, audited.z, audited.r))
     gate = replace(gate, purity=f"{gate.purity}; {again(told, domain, problem.arithmetic, seed)}")
+    unchanged(backend, gate.first, seed)
     return conclude(asked, gap, problem, record, audited, gate, strong, book)  # what may be said
 
 

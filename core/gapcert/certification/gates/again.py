@@ -19,13 +19,12 @@ from gapcert.numerics.errors import UsageError
 
 
 def in_calls(residual: Residual, z: Array) -> Array:
-    """r(z), of which f̂ is asked half in calls of 1, 2, …, 64, 1, … rows, a quarter in growing ones, and the rest in one."""
-    small = np.cumsum(np.resize(np.arange(1, THRESHOLDS.small_call + 1), len(z)))
-    small = small[small <= min(len(z) // 2, THRESHOLDS.small_calls_rows)]
-    last = int(small.max(initial=0))
-    grown = last + np.cumsum(THRESHOLDS.small_call * 1.4 ** np.arange(1, 40)).astype(int)
-    cuts, (x, u) = [*small, *grown[grown <= last + len(z) // 4]], (z[:, : residual.model.nx], z[:, residual.model.nx :])
-    x, u = np.ascontiguousarray(x), np.ascontiguousarray(u)
+    """r(z): at first f̂ is asked in calls of 1, 2, …, 64, 1, … rows, then a quarter in growing ones, and the rest in one."""
+    nx, most = residual.model.nx, min(len(z) // 2, THRESHOLDS.small_calls_rows)
+    small = np.cumsum(np.resize(np.arange(1, THRESHOLDS.small_call + 1), most))
+    grown = most + np.cumsum(THRESHOLDS.small_call * 1.4 ** np.arange(40)).astype(int)
+    cuts = [*small[small <= most], *grown[grown <= most + len(z) // 4]]
+    x, u = np.ascontiguousarray(z[:, :nx]), np.ascontiguousarray(z[:, nx:])
     after = [residual.backend.step(x[rows], u[rows]).x for rows in np.split(np.arange(len(z)), cuts)]
     return difference(residual.model.states, np.concatenate(after), residual.model.step(x, u).x)
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from gapcert.certification.gates.hidden_distribution import HiddenDraws, Paired
 from gapcert.certification.gates.hidden_state import Gate, HiddenPlan, open_gate
-from gapcert.certification.gates.purity import purity
+from gapcert.certification.gates.purity import answered, purity
 from gapcert.certification.samples.store import Store
 from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.gaps.lipschitz import Residual
@@ -51,6 +51,7 @@ def enter(
     def told(of: str) -> Callable[[str], None]:
         return lambda what: pulse(next(probes), text=f"{of} {what}")
 
+    first = answered(backend, domain, seed)
     for role, system in (("model", model), ("backend", backend)):
         probed = purity(role, system, domain, executor, seed, told(role))
     gate = open_gate(model, backend, domain, plan, seed, told("hidden state,"))
@@ -63,7 +64,7 @@ def enter(
     warnings = tuple(responses(Residual(gate.system, model), domain, seed))
     for warning in warnings:
         emit(Event("warning", "gates", {"message": warning}))
-    return replace(gate, purity=probed, warnings=warnings)
+    return replace(gate, purity=probed, warnings=warnings, first=first)
 
 
 def responses(residual: Residual, domain: Domain, seed: int) -> list[str]:
