@@ -112,7 +112,7 @@ def certify(
         audited = audit(gap, problem, asked, strong, book, record)  # attacked at points that no fit has seen
     told = ((store.residual, problem.samples.z, problem.samples.r), (strong.residual, audited.z, audited.r))
     gate = replace(gate, purity=f"{gate.purity}; {again(told, domain, problem.arithmetic, seed)}")
-    unchanged(backend, gate.first, seed)
+    unchanged(drawn, gate.first, seed)
     return conclude(asked, gap, problem, record, audited, gate, strong, book)  # what may be said
 
 
