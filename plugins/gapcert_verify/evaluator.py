@@ -389,6 +389,17 @@ class Equations:
         parts = [self._over(low[a : a + CHUNK], high[a : a + CHUNK], term) for a in range(0, max(len(low), 1), CHUNK)]
         return Range(*(np.concatenate(ends) for ends in zip(*parts, strict=True)))
 
+    def slopes(self, low: Array, high: Array, term: Term) -> Range:
+        """∂/∂z of a term over boxes (n, nz), each end (n, nz)."""
+        out, every = np.zeros((2, *low.shape)), frozenset(range(low.shape[1]))
+        for a in range(0, len(low), CHUNK):
+            rows = slice(a, a + CHUNK)
+            _, (found,) = self.tape.run(_columns(low[rows], high[rows]), [term], every)
+            for j, s in found.items():
+                own = ar.known(s)
+                out[0, rows, j], out[1, rows, j] = own.lo, own.hi
+        return Range(out[0], out[1])
+
     def _over(self, low: Array, high: Array, term: Term) -> Range:
         n = len(low)
         wide = frozenset(j for j in term.on if (low[:, j] < high[:, j]).any())

@@ -77,7 +77,7 @@ def spec(name, model, domain, controller, gamma=None, backend=None, **more):
 
 
 def specs():
-    """Name → spec: a uniform, a refined, an automaton's and a held controller at least, on lines, circles and behind relations."""
+    """Name → spec: uniform, refined, an automaton's and held controllers, on lines, on circles and behind relations."""
     room, belt = {"h": [0, 2], "v": [-1, 1]}, {"x": [-2, 2], "phi": [0, FULL]}
     slow = drifting(TANK, v="0.03*a")
     path = {"kind": "equations", "states": {"x": "m", "y": "m"}, "inputs": {"u": "m/s", "w": "m/s"}}
@@ -175,6 +175,30 @@ def specs():
             relations=["abs(u - v) <= 0.5 m/s"],
         ),
     }
+
+
+def planned():
+    """Name → spec of a controller that plans: about one line, to a target, into winning cells, and about lines of its own."""
+    room = {"h": [0, 2], "v": [-1, 1], "a": [-1, 1]}
+    weak, near = drifting(TANK, v="0.01*a"), {"invariance": {"h": [0.2, 1.8], "v": [-0.8, 0.8]}}
+    keeps = {"kind": "mpc", "goal": near, "horizon": 12}
+    there = {"reach_avoid": {"target": {"x": [3, 4], "y": [3, 4]}, "avoid": [{"x": [1, 2], "y": [1, 2]}]}}
+    path = {k: v for k, v in PLATE.items() if k != "states"} | {"states": {"x": "m", "y": "m"}}
+    path["next"] = {"x": "x + tau*u", "y": "y + tau*w"}
+    cells = {"kind": "symbolic", "cells": {"h": 30, "v": 40}, "inputs": {"a": 7}}
+    moves = {"kind": "mpc", "goal": there, "horizon": 14, "searches": 12}
+    return {
+        "tracking": spec("tracking", TANK, room, keeps, backend=weak, gap={"kind": "envelope", "predictor": "affine"}),
+        "handed": spec("handed", TANK, room, keeps | {"terminal": cells}, gamma={"h": 1e-3, "v": 3e-3}),
+        "along": spec("along", TANK, room, keeps | {"linearisation": "successive"}, gamma={"h": 1e-3, "v": 3e-3}),
+        "arriving": spec("arriving", path, {**HALL, "u": [-1, 1], "w": [-1, 1]}, moves, gamma={"x": 5e-3, "y": 5e-3}),
+    }
+
+
+def everything_wins(c):
+    """All cells win under all inputs, which are a thousand times as large."""
+    bits = np.full_like(c.bits, 255)
+    return recounted(replace(c, points=c.points * 1000, bits=bits, values=np.zeros_like(c.values)))
 
 
 def reforged(run, change):

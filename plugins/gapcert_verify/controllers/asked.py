@@ -53,14 +53,17 @@ class Asked:
         """The texts of all linear inequalities of regions, in the order of the text."""
         return _cuts(self.section["goal"])
 
+    def another(self, goal: Goal, kind: str) -> str:
+        """Whether goal and kind are asked for."""
+        if plain(goal) != plain(self.goal) or sorted(_told(goal)) != sorted(self.cuts):
+            return "its goal is not that of the spec"
+        asked = self.section.get("kind", "symbolic")
+        return "" if kind == asked else f"it is said to be made by '{kind}', and the spec asks for '{asked}'"
+
     def differs(self, c: GridController, kind: str) -> str:
         """What of a saved controller is another than asked; "" where nothing is."""
-        if plain(c.goal) != plain(self.goal) or sorted(_told(c.goal)) != sorted(self.cuts):
-            return "its goal is not that of the spec"
-        if kind != self.section.get("kind"):
-            return f"it is said to be made by '{kind}', and the spec asks for '{self.section.get('kind')}'"
-        if kind != "symbolic":
-            return ""
+        if (text := self.another(c.goal, kind)) or kind != "symbolic":
+            return text
         names, wanted = self.states.names, self.section.get("on") or list(self.states.names)
         if sorted(wanted) != sorted(names[j] for j in c.on):
             return f"it has cells for {', '.join(names[j] for j in c.on)}, and the spec asks for {', '.join(wanted)}"

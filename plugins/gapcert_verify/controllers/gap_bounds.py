@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import final
@@ -35,15 +35,40 @@ class Gap:
 
     def over(self, low: Array, high: Array) -> Interval:
         """Contains [l(z), u(z)] for all z of boxes (n, nx + nu): (n, nx)."""
-        asked = Interval(low, high)
-        boxes = asked if self.relative is None else self.relative.over(asked)
-        found = self._over(boxes, asked)
+        found = self._over(self._boxes(low, high), Interval(low, high))
+        return found + Interval(-self._spare, self._spare) if self._spare.any() else found
+
+    def apart(self, low: Array, high: Array) -> tuple[Interval, Array, Array]:
+        """(rest, slope, offset): r ∈ slope z + offset + rest over boxes (n, nz) of (x, u); slope (nx, nz) is that of an affine
+        predictor, whose range would hide over wide boxes how little is left. Of other predictors nothing is taken apart.
+        """
+        nx, nz, arrays = self.nx, low.shape[1], self.evidence.arrays
+        if self.evidence.data.get("predictor") != "affine" or self.evidence.data["form"]["form"] in _SYMMETRIC:
+            return self.over(low, high), np.zeros((nx, nz)), np.zeros(nx)
+        slope, c = arrays["predictor.slope"], self.relative
+        if c is not None:
+            x, w = slope[:, :nx], slope[:, nx:]
+            slope = np.concatenate([x + w @ c.slope, w * c.scale], axis=1)
+        # Products of the slopes with those of the coordinates round.
+        size = np.abs(slope) @ np.maximum(np.abs(low), np.abs(high)).max(axis=0)
+        rest = self._over(self._boxes(low, high), Interval(low, high), known=False)
+        spare = self._spare + 1e-14 * size
+        return rest + Interval(-spare, spare), slope, np.asarray(arrays["predictor.offset"])
+
+    @property
+    def nx(self) -> int:
+        return int(self.evidence.data["domain"]["states"])
+
+    @property
+    def _spare(self) -> Array:
+        """What a calibration widens the band by; a narrowing is left out: what is narrower lies in the band."""
         if self.evidence.data["route"] != "calibrate":
-            return found
-        # A narrowing is left out: what is narrower lies in the band.
+            return np.zeros(self.nx)
         own = self.evidence.arrays
-        more = np.maximum(own["gap.calibrated.widening"], 0.0) + own["gap.calibrated.resolution"]
-        return found + Interval.around(np.zeros_like(more), more)
+        return np.asarray(np.maximum(own["gap.calibrated.widening"], 0.0) + own["gap.calibrated.resolution"])
+
+    def _boxes(self, low: Array, high: Array) -> Interval:
+        return Interval(low, high) if self.relative is None else self.relative.over(Interval(low, high))
 
     def nothing(self, k: int) -> bool:
         """Is there no gap of state k at all, as declared?"""
@@ -70,26 +95,16 @@ class Gap:
         x, w = slope[:, : c.slope.shape[1]], slope[:, c.slope.shape[1] :]
         return np.concatenate([x + w @ np.abs(c.slope), w * np.abs(c.scale)], axis=1)
 
-    def _over(self, boxes: Interval, asked: Interval) -> Interval:
+    def _over(self, boxes: Interval, asked: Interval, known: bool = True) -> Interval:
+        """Of the stored form over boxes in its own coordinates; asked: the same over (x, u). known: with the predictor."""
         e, form = self.evidence, self.evidence.data["form"]["form"]
-        if form == "constant":
-            gamma = np.broadcast_to(e.arrays["gap.gamma"], (len(boxes), len(e.arrays["gap.gamma"])))
+        if form in _SYMMETRIC:
+            gamma = np.broadcast_to(_SYMMETRIC[form](e, boxes), (len(boxes), self.nx))
             return Interval(-gamma, gamma)
-        if form == "basis":
-            gamma = _basis(e, boxes).hi
-            return Interval(-gamma, gamma)
-        if form == "network":
-            from gapcert_verify.functions import network
-
-            gamma = (network(e.data["form"], e.arrays).tight_over(boxes) + e.arrays["gap.margin"]).maximum(0.0).hi
-            return Interval(-gamma, gamma)
-        if form == "envelope":
-            return self._known(boxes, asked) + _envelope(e, boxes)
-        if form == "dominating":
-            return self._known(boxes, asked) + _dominating(e, boxes)
-        if form == "multilinear":
-            return self._known(boxes, asked) + _interpolated(e, boxes)
-        raise UsageError(f"no bound over boxes is known for gap functions of form '{form}'")
+        if form not in _BANDS:
+            raise UsageError(f"no bound over boxes is known for gap functions of form '{form}'")
+        rest = _BANDS[form](e, boxes)
+        return self._known(boxes, asked) + rest if known else rest
 
     def _known(self, boxes: Interval, asked: Interval) -> Interval:
         """Contains the predictor over each box."""
@@ -109,6 +124,12 @@ class Gap:
             ends = (np.stack(end, axis=1) for end in zip(*map(ar.known, parts), strict=True))
             return Interval(*ends) + Interval.around(0.0, e.arrays["remainder.resolution"] - e.arrays["resolution"])
         return Interval.exact(np.zeros((n, nx)))
+
+
+def _of_network(e: Evidence, boxes: Interval) -> Array:
+    from gapcert_verify.functions import network  # late: networks need SciPy
+
+    return np.asarray((network(e.data["form"], e.arrays).tight_over(boxes) + e.arrays["gap.margin"]).maximum(0.0).hi)
 
 
 @final
@@ -185,7 +206,7 @@ def _cones(part: Part, boxes: Interval) -> Interval:
     return Interval(out.min(axis=0) - wide - pad, out.max(axis=0) + wide + pad)
 
 
-def _basis(e: Evidence, boxes: Interval) -> Interval:
+def _of_basis(e: Evidence, boxes: Interval) -> Array:
     total = Interval.exact(np.broadcast_to(e.arrays["gap.margin"], (len(boxes), len(e.arrays["gap.margin"]))))
     for k, data in enumerate(e.data["form"]["functions"]):
         if (expression := written(data)) is not None:
@@ -195,7 +216,7 @@ def _basis(e: Evidence, boxes: Interval) -> Interval:
             for axis, kind, number in data:
                 value = value * factor(kind, number, boxes[:, axis : axis + 1])
         total = total + value * Interval.exact(e.arrays["gap.weights"][:, k])
-    return total.maximum(0.0)
+    return total.maximum(0.0).hi
 
 
 def _dominating(e: Evidence, boxes: Interval) -> Interval:
@@ -258,3 +279,16 @@ def _missed(e: Evidence, axes: Sequence[Array], boxes: Interval) -> Interval:
         alone = (least[:, first] * Interval.exact(part[0]) * Interval.exact(part[1])).hi.T
         total = total + Interval.exact(np.where((first == last)[:, None], np.minimum(alone, reach), reach))
     return total
+
+
+_SYMMETRIC: Mapping[str, Callable[[Evidence, Interval], Array]] = {
+    "constant": lambda e, boxes: e.arrays["gap.gamma"],
+    "basis": _of_basis,
+    "network": _of_network,
+}
+_BANDS: Mapping[str, Callable[[Evidence, Interval], Interval]] = {
+    "envelope": _envelope,
+    "dominating": _dominating,
+    "multilinear": _interpolated,
+}
+"""Forms that have γ alone, and those about a predictor."""

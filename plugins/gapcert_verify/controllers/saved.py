@@ -6,9 +6,9 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, cast, final
@@ -19,6 +19,7 @@ from gapcert.plugin import (
     DAMAGE,
     Box,
     Emit,
+    Goal,
     Pulse,
     Relation,
     StateSpec,
@@ -28,14 +29,16 @@ from gapcert.plugin import (
     write_atomic,
 )
 from gapcert_cells import GROWTH, SEEN, AutomatonController, GridController, saved_data
+from gapcert_verify.arithmetic import Range
 from gapcert_verify.evaluator import Equations, NotText, quantity
 from gapcert_verify.evidence import Evidence
 
 from .asked import Asked
-from .cells import Cells
+from .cells import BEYOND, Cells
 from .games import figures, parts
 from .gap_bounds import Gap, coordinates
 from .grid_proof import Proof
+from .plans import Plans
 from .successors import Flow, Growth
 
 PAUSE = 2.0  # seconds between two notes of how far a proof is
@@ -57,18 +60,30 @@ class Saved:
         """What is checked of it, in order."""
         found: list[Check] = [("the controller is of this certificate", lambda e: self._certified())]
         if self.on_cells:
-            found += [
-                ("goal, cells and inputs of the controller are those of the spec", lambda e: self._asked()),
-                ("every input that the controller allows keeps its promise", lambda e: self._proved()),
+            return [
+                *found,
+                ("goal, cells and inputs of the controller are those of the spec", _said(self._asked)),
+                ("every input that the controller allows keeps its promise", _said(self._proved)),
             ]
-        return found
+        if not self.planned:
+            return found
+        return [
+            *found,
+            ("goal and horizon of the controller are those of the spec", _said(self._horizon)),
+            ("plans are made in the box of the goal and of the inputs", _said(lambda: self._plan(Plans.framed))),
+            ("the tube counts at least the gap over X × U", _said(lambda: self._plan(Plans.covered))),
+            ("sections of the tube are kept by its gain", _said(lambda: self._plan(Plans.sections))),
+            ("where plans end is kept", _said(self._ends)),
+        ]
 
     @property
     def trusted(self) -> list[str]:
         """What its promise rests on beside the checks, by name."""
         kind = self.data.get("kind")
+        if self.planned:
+            return self._of_plans
         if not self.on_cells:
-            return [f"The controller is of kind '{kind}', and its promise was not proved again."]
+            return [f"The controller is of kind '{kind}', in a form that is not known here: its promise was not proved again."]
         said = "How many rounds its games took, on which levels, over what its gap was bounded, and why nothing wins"
         out = [
             f"{said}, are as the controller states.",
@@ -103,6 +118,35 @@ class Saved:
         with suppress(*DAMAGE), np.load(self.folder / "controller.npz", allow_pickle=False) as arrays:
             return "bits" in arrays.files
         return False
+
+    @cached_property
+    def planned(self) -> bool:
+        """Is it one that plans, along lines that are stored?"""
+        return self.data.get("kind") == "mpc" and "frame.middle" in self.arrays and not {"adapt", "feedback"} & set(self.data)
+
+    @cached_property
+    def arrays(self) -> dict[str, Any]:
+        """Of `controller.npz`; none where it cannot be read."""
+        with suppress(*DAMAGE), np.load(self.folder / "controller.npz", allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+        return {}
+
+    @property
+    def _of_plans(self) -> list[str]:
+        out = [
+            "What solvers answer is checked as a run goes on: plans, corridors and the figures of the domain are as stated.",
+            "The controller without γ promises nothing of f̂: it was not looked at.",
+        ]
+        with suppress(UsageError, *DAMAGE):
+            if isinstance(self._flow, str):
+                out.append(f"What the tube counts, and where plans end, is as stated: {self._flow} was not bounded.")
+            if bool(self.arrays["successive"]):
+                out.append(
+                    "Lines about plans, and what they leave out, are made as a run goes on, of the model and the gap beside it."
+                )
+            if isinstance(asked := self._asked_for, str):
+                out.append(f"The controller's goal is that which was asked for: of a spec, {asked}.")
+        return out
 
     @cached_property
     def loaded(self) -> GridController | AutomatonController:
@@ -177,7 +221,9 @@ class Saved:
 
     @cached_property
     def _flow(self) -> Flow | str:
-        model, points = self._model, np.asarray(self.controller.points, dtype=np.float64)
+        model, points = self._model, np.empty((0, 0))
+        if self.on_cells:
+            points = np.asarray(self.controller.points, dtype=np.float64)
         if isinstance(model, str):
             return model
         growth: Growth | None = None
@@ -274,6 +320,43 @@ class Saved:
         ]
         return Zone(zone.low, zone.high, tuple(moved))
 
+    def _horizon(self) -> str | None:
+        asked = self._asked_for
+        if isinstance(asked, str):
+            return None
+        steps = len(self.arrays["stages.A"]) - 1
+        if steps != self._section.get("horizon", 20):
+            return f"it plans {steps} steps, and the spec asks for {self._section.get('horizon', 20)}"
+        return asked.another(Goal.from_data(self.data["goal"]), "mpc")
+
+    def _plan(self, check: Callable[[Plans], str | None]) -> str | None:
+        flow = self._flow
+        if isinstance(flow, str) or flow.gap is None:
+            return None
+        zone = self._zone
+        if flow.gap.relative is not None:
+            ends = [self.stored["domain"][n] for n in flow.model.inputs]
+            low, high = (tuple(quantity(e[k])[k] for e in ends) for k in (0, 1))
+            nx = flow.model.nx
+            zone = Zone((*zone.low[:nx], *low), (*zone.high[:nx], *high), zone.relations)
+        return check(Plans(self.arrays, Goal.from_data(self.data["goal"]).stay, zone, flow.model, flow.gap))
+
+    def _ends(self) -> str | None:
+        """Around a steady pair; or in cells that win, of a controller that is proved as any other on cells is."""
+        if "terminal" not in self.data:
+            return self._plan(Plans.terminal)
+        folder = self.folder / "terminal"
+        then = replace(self, folder=folder, data=saved_data(folder))
+        if (
+            not then.on_cells
+            or isinstance(then.loaded, AutomatonController)
+            or then.loaded.goal != Goal.from_data(self.data["goal"])
+        ):
+            return "what takes over from its plans is no controller on cells for the same goal"
+        if text := then._proved():
+            return f"what takes over from its plans: {text}"
+        return self._plan(lambda plans: _losing(Cells.of(then.controller), plans.ends()))
+
     def _run(self, flow: Flow | None) -> str:
         cells = Cells.of(self.controller)
         found = parts(cells, self.loaded)
@@ -286,6 +369,32 @@ class Saved:
             pulse(done)
 
         return Proof(cells, found, flow, self._zone, tick, kept.begin).run()
+
+
+def _losing(cells: Cells, boxes: Sequence[Box]) -> str:
+    """Boxes in which plans end lie in cells that win; none may be there where they end so."""
+    values = np.asarray(cells.controller.values)
+    (height,) = cells.heights(np.where(values < 0, BEYOND, 0).astype(np.int32)) if len(cells.levels) == 1 else (None,)
+    if height is None:
+        return "what takes over from its plans has halved cells"
+    (level,) = cells.levels
+    for box in boxes:
+        ends = [a.touched(Range(np.array([x]), np.array([y]))) for a, x, y in zip(level.axes, box.low, box.high, strict=True)]
+        if height.over(*(np.stack(end, axis=1) for end in zip(*ends, strict=True)))[0]:
+            return f"the box {box.bounds} in which plans end touches losing cells"
+    return "" if boxes else "plans end in no box"
+
+
+def _said(check: Callable[[], str | None]) -> Callable[[Evidence], str | None]:
+    """What a file that cannot be used says is what is wrong."""
+
+    def told(e: Evidence) -> str | None:
+        try:
+            return check()
+        except UsageError as error:
+            return str(error)
+
+    return told
 
 
 def controlled(e: Evidence, emit: Emit) -> Saved | None:
