@@ -80,7 +80,14 @@ class Certified(Statement):
         relative = model.relative if isinstance(model, RelativeModel) else None
         f = model.inner if isinstance(model, RelativeModel) else model
         assert isinstance(f, Model), "the nominal side of a certificate is a model"
-        return cls(f, certificate.domain.zone, certificate.gap.interval, relative, certificate.claim, getattr(certificate, "window", None))
+        return cls(
+            f,
+            certificate.domain.zone,
+            certificate.gap.interval,
+            relative,
+            certificate.claim,
+            getattr(certificate, "window", None),
+        )
 
     @classmethod
     def load(cls, folder: Path | str, allow_code: bool = False) -> Certified:

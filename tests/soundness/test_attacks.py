@@ -139,7 +139,7 @@ def test_no_sentence_hides_a_refutation():
 
 
 def test_an_empirical_claim_does_not_survive_samples_that_refute_it(tmp_path, monkeypatch):
-    monkeypatch.setattr(contradiction, "constants", lambda asked, bound: None)  # as of an engine, whose equations nobody has
+    monkeypatch.setattr(contradiction, "hunt", lambda *asked: False)  # as of an engine, whose equations nobody has
     one_step = {"states": {"x": "1"}, "inputs": {"u": "1"}, "period": "100 ms", "kind": "equations"}
     spec = {
         "version": 1,

@@ -27,8 +27,8 @@ from gapcert.certification.gates.again import again
 from gapcert.certification.gates.augment import widen
 from gapcert.certification.gates.circle import repeating
 from gapcert.certification.gates.hidden_state import Gate, HiddenPlan
-from gapcert.certification.ledger import Ledger
 from gapcert.certification.gates.purity import unchanged
+from gapcert.certification.ledger import Ledger
 from gapcert.certification.refutation import watched
 from gapcert.certification.routes import Findings, Request, Route
 from gapcert.certification.samples.designs import AdaptiveSampling, GridSampling, LatticeSampling, Sampling, axes_of, refined

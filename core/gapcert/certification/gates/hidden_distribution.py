@@ -293,8 +293,8 @@ class Around(Law):
 
     def describe(self) -> str:
         return (
-            f"in equal parts at its default, as rollouts of up to {THRESHOLDS.harmless_steps} steps leave it, and moved from its "
-            f"default as the probe does"
+            f"in equal parts at its default, as rollouts of up to {THRESHOLDS.harmless_steps} steps leave it, and moved from "
+            f"its default as the probe does"
         )
 
     def follows(self) -> str:
