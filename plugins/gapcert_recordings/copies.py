@@ -215,7 +215,7 @@ def _meetings(series: Sequence[_Series], within: bool) -> dict[tuple[int, int], 
         for a, b, fine, shift in _alike(points, step, within):
             rows = np.arange(len(series[b].t))
             place = step * rows + float(shift) if fine == a else (rows - float(shift)) / step
-            found.setdefault((a, b), []).append(place)
+            found.setdefault((a, b), []).append(np.asarray(place))
     for a, b in itertools.combinations(every, 2) if len(slower) > 1 else ():
         if abs(periods[a] - periods[b]) > 0.02 * periods[a]:
             found.setdefault((a, b), []).extend(_resampled(series[a], series[b]))

@@ -91,7 +91,7 @@ def purity(
         d = max(d, _same(role, system, rows, first, index, answer, what))
         if len(answer.x) >= THRESHOLDS.purity_rows:
             tell(what)
-    # Company may change last bits, within e, as where loops are vectorised. The same call has the same bits whenever it is made.
+    # Company may change last bits, within e, as where loops are vectorised. The same call has the same bits at any time.
     for what, asked in (
         ("asked again in the same call", system),
         ("asked of a fresh copy", pickle.loads(pickle.dumps(system))),
