@@ -19,7 +19,7 @@ from gapcert.contracts.data.units import base
 from gapcert.contracts.gaps.lipschitz import Residual
 from gapcert.contracts.systems.domain import Domain
 from gapcert.contracts.systems.system import Model, System, difference
-from gapcert.numerics.arrays import Array, Bools
+from gapcert.numerics.arrays import Array, Bools, Ints
 from gapcert.numerics.digest import json_digest
 
 Known = Mapping[str, Any]
@@ -109,7 +109,7 @@ class Fingerprint:
         return {"ends": np.stack([low, high]), "z": z, "values": values, "e": e, "diagonal": len(diagonal)}
 
     @cached_property
-    def _axes(self) -> Array:
+    def _axes(self) -> Ints:
         """Axes that count: no inputs that nothing depends on, nor states that depend on nothing else either and have no gap."""
         z, values, e, nx = *(self._all[k] for k in ("z", "values", "e")), self.domain.nx
         zone, moved = self.domain.zone, np.zeros((z.shape[1], nx), dtype=bool)
@@ -121,7 +121,7 @@ class Fingerprint:
         moved[np.arange(nx), np.arange(nx)] = False
         counts = zone.matrix[cuts].any(axis=0) | moved.any(axis=1)
         counts[:nx] |= moved.any(axis=0) | (np.abs(values[1] - values[0]) > 4 * e[0]).any(axis=0)
-        return np.flatnonzero(counts)
+        return np.flatnonzero(counts).astype(np.int64)
 
     def _answers(self, z: Array) -> Array:
         """(3, n, nx): f, f̂ (of its draws the mean), and the deviation of f̂'s draws, at points z (n, nz)."""
@@ -149,7 +149,8 @@ class Fingerprint:
             from scipy.optimize import linprog
 
             rows, box = np.eye(len(zone.low)), list(zip(zone.low, zone.high, strict=True))
-            ends = np.array([[s * linprog(s * row, zone.matrix, zone.bounds, bounds=box).fun for row in rows] for s in (1, -1)])
+            found = [[linprog(s * row, zone.matrix, zone.bounds, bounds=box).x @ row for row in rows] for s in (1, -1)]
+            ends = np.array(found)
         return np.asarray(ends * self._unit)
 
     def _inside(self, ends: Array, order: Sequence[int]) -> Bools:

@@ -47,7 +47,7 @@ class Entry:
 
     def summary(self) -> dict[str, Any]:
         """`number`, and in `book` what the book knows it by."""
-        own = {"number": self.k, "kind": self.kind, "question": self.question, "audited": self.audited}
+        own: dict[str, Any] = {"number": self.k, "kind": self.kind, "question": self.question, "audited": self.audited}
         damage = {k: v for k, v in (("lost", self.lost), ("edited", self.edited)) if v}
         return {"number": self.k} | ({"book": own | damage} if self.question else {})
 
