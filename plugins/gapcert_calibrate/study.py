@@ -46,6 +46,6 @@ def calibrated(build: Build, model: Model, recording: Recording) -> CalibratedRe
     )
     question = json.dumps([model.digest(), recording.digest(), domain.digest_data()])
     named = hashlib.sha256(question.encode()).hexdigest()
-    identity = Fingerprint(model, model, domain, content(made), named)
-    entry = Ledger(build.out / "ledger.json").enter(identity, "calibration", made.digest())
+    of = Fingerprint(model, model, domain, content(made), named)
+    entry = Ledger(build.out / "ledger.json").enter(of, "calibration", made.digest())
     return replace(made, entry=entry, versions={**made.versions, **build.versions()})

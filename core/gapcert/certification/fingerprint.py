@@ -121,7 +121,7 @@ class Fingerprint:
         moved[np.arange(nx), np.arange(nx)] = False
         counts = zone.matrix[cuts].any(axis=0) | moved.any(axis=1)
         counts[:nx] |= moved.any(axis=0) | (np.abs(values[1] - values[0]) > 4 * e[0]).any(axis=0)
-        return np.asarray(np.flatnonzero(counts))
+        return np.flatnonzero(counts).astype(np.int64)
 
     def _answers(self, z: Array) -> Array:
         """(3, n, nx): f, f̂ (of its draws the mean), and the deviation of f̂'s draws, at points z (n, nz)."""
@@ -149,8 +149,8 @@ class Fingerprint:
             from scipy.optimize import linprog
 
             rows, box = np.eye(len(zone.low)), list(zip(zone.low, zone.high, strict=True))
-            reached = [[linprog(s * row, zone.matrix, zone.bounds, bounds=box).fun for row in rows] for s in (1, -1)]
-            ends = np.array(reached, dtype=np.float64) * [[1], [-1]]
+            found = [[linprog(s * row, zone.matrix, zone.bounds, bounds=box).x @ row for row in rows] for s in (1, -1)]
+            ends = np.array(found)
         return np.asarray(ends * self._unit)
 
     def _inside(self, ends: Array, order: Sequence[int]) -> Bools:
