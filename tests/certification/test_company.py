@@ -49,7 +49,13 @@ def certified(engine, folder, claim="deterministic", seed=0):
 
 def refused_by_contract(kind, clean):
     contract = type("Contract", (SystemContract,), {"system": lambda self: Circumstantial(kind, clean=clean)})()
-    for check in ("company_does_not_matter", "failures_leave_no_trace", "rollout_equals_steps", "batch_equals_singles", "pickles"):
+    for check in (
+        "company_does_not_matter",
+        "failures_leave_no_trace",
+        "rollout_equals_steps",
+        "batch_equals_singles",
+        "pickles",
+    ):
         try:
             getattr(contract, f"test_{check}")()
         except AssertionError:
@@ -92,7 +98,7 @@ def test_without_the_last_look_a_false_claim_passes(tmp_path, monkeypatch):
         return Circumstantial("bulk")
 
     monkeypatch.setattr(impure, "KINDS", {"bulk": lambda z, c: np.full(len(z), c.n < 160)})
-    with pytest.raises(gc.UsageError, match="64 of 64 measured rows, asked again alone, differ by up to 0.05, and rounding"):
+    with pytest.raises(gc.UsageError, match=r"64 of 64 measured rows, asked again alone, differ by up to 0\.05, and rounding"):
         certified(bulk(), tmp_path / "seen")
     monkeypatch.setattr(steps, "again", lambda *_: "nothing was asked again")
     assert not certified(bulk(), tmp_path / "blind").holds  # the audit's small calls see it as well
@@ -112,7 +118,7 @@ def test_what_changes_between_gates_and_measurement_is_seen_at_the_end(tmp_path,
     monkeypatch.undo()
     asked = sum(seen)
     monkeypatch.setattr(impure, "KINDS", {"aged": lambda z, c: np.full(len(z), c.calls >= asked)})
-    with pytest.raises(gc.UsageError, match="the same 64 queries asked again at the end differ by up to 0.05"):
+    with pytest.raises(gc.UsageError, match=r"the same 64 queries asked again at the end differ by up to 0\.05"):
         certified(Circumstantial("aged"), tmp_path)
     monkeypatch.setattr(steps, "unchanged", lambda *_: None)
     c = certified(Circumstantial("aged"), tmp_path / "blind")

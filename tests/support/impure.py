@@ -296,7 +296,9 @@ def violated(certificate: gc.Certificate, made: Callable[[], gc.Backend], rows: 
     return int(((r < low) | (r > high)).any(axis=1).sum()), len(z)
 
 
-def _walk(engine: gc.Backend, zone: gc.Domain, rng: np.random.Generator, loops: int = 10, steps: int = 60) -> tuple[Array, Array]:
+def _walk(
+    engine: gc.Backend, zone: gc.Domain, rng: np.random.Generator, loops: int = 10, steps: int = 60
+) -> tuple[Array, Array]:
     """Ten loops at once, inputs held for ten periods, hidden state handed on."""
     z = zone.draw(loops, rng)
     x, u, hidden = z[:, :2], z[:, 2:], None

@@ -38,7 +38,9 @@ class Thresholds:
     purity_rungs: int = chosen(14, "of a ladder of close rows: from its length down to 6e-7 of it")
     small_call: int = chosen(64, "rows of the largest of an audit's small calls")
     small_calls_rows: int = chosen(1_500, "of an audit, at most, that are asked in small calls, which cost an engine more")
-    again_rows: int = chosen(64, "of the samples and of the audit, each, that are asked again alone: more cost a certificate time")
+    again_rows: int = chosen(
+        64, "of the samples and of the audit, each, that are asked again alone: more cost a certificate time"
+    )
     held_periods: int = chosen(512, "at most, that one row is asked in a row: a counter in a system shows by then")
     response_error: float = chosen(0.1, "relative, between what an input moves in f̂ and in f: a warning, no refusal")
     response_rows: int = chosen(16, "states at which an input is moved from end to end")

@@ -75,9 +75,8 @@ def purity(
 
     tell: hears each probe before the next one.
     """
-    rows = queries(system, domain, seed)
+    rows, first = answered(system, domain, seed)
     tell("asked once")
-    first = apart(system, rows, seed)
     if (lost := ~np.isfinite(first.x).all(axis=1)).any():
         k = int(np.argmax(lost))
         z = np.concatenate([rows.x[k], rows.u[k]])
@@ -90,11 +89,17 @@ def purity(
         d = max(d, _same(role, system, rows, first, index, answer, what))
         if len(answer.x) >= THRESHOLDS.purity_rows:
             tell(what)
-    # Company may change last bits, within e, as where loops are vectorised. The same call has the same bits, whatever came before.
-    for what, asked in (("asked again in the same call", system), ("asked of a fresh copy", pickle.loads(pickle.dumps(system)))):
+    # Company may change last bits, within e, as where loops are vectorised; the same call has the same bits at any time.
+    for what, asked in (
+        ("asked again in the same call", system),
+        ("asked of a fresh copy", pickle.loads(pickle.dumps(system))),
+    ):
         _same(role, system, rows, first, slice(None), apart(asked, rows, seed), what, exact=True)
         tell(what)
-    said, there = "repeated and permuted queries, close neighbours, other sizes of call", _elsewhere(system, rows, executor, seed)
+    said, there = (
+        "repeated and permuted queries, close neighbours, other sizes of call",
+        _elsewhere(system, rows, executor, seed),
+    )
     if isinstance(there, str):
         return f"{said} and a fresh copy {agreed(d)} ({there})"
     for k, (index, answer) in enumerate(there):
@@ -165,8 +170,8 @@ def held(system: System, rows: Queries, first: Step) -> Iterator[tuple[str, Any,
 def _same(
     role: str, system: System, rows: Queries, first: Step, index: Any, answer: Step, what: str, exact: bool = False
 ) -> float:
-    """The largest difference, 0 where all bits agree; UsageError beyond e, or of any bit where answers are to be `exact`: by state,
-    where, and beside the mean |x⁺ − x|.
+    """The largest difference, 0 where all bits agree; UsageError beyond e, or of any bit where answers are to be `exact`: by
+    state, where, and beside the mean |x⁺ − x|.
     """
     expected = Step(first.x[index], None if first.hidden is None else first.hidden[index])
     if _bits(expected) == _bits(answer):
