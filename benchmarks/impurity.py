@@ -1,8 +1,8 @@
 """Engines that answer by more than their arguments: how often they get a claim, and how often it is false.
 
-Kinds of `tests/support/impure.py`, with drawn sizes, and drawn ones. A claim is held against new engines, asked row by
-row, all at once and along closed loops: deterministic, one step outside of [l, u] makes it false; statistical, more
-than ε of them and five deviations. Rows are kept in a file and not asked again.
+Kinds of `tests/support/impure.py`, with drawn sizes, and drawn ones. A claim is held against new engines, asked row by row, all
+at once and along closed loops: deterministic, one step outside of [l, u] makes it false; statistical, more than ε of them and
+five deviations. Rows are kept in a file and not asked again.
 """
 
 from __future__ import annotations

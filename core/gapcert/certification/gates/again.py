@@ -1,6 +1,6 @@
 """Company in a measurement: an audit asks in small calls as well, and at the end some of all rows are asked once more.
 
-The gates ask few rows; that a measurement's many, in calls of thousands, got what a user gets is seen only afterwards.
+The gates ask few rows. Whether the many of a measurement got what a user gets shows only afterwards.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ def again(measured: Sequence[tuple[Residual, Array, Array]], domain: Domain, e: 
         z, r, count = z[rows], r[rows], count + len(rows)
         alone = difference(residual.model.states, _alone(residual.backend, z, domain), residual.model.step(*domain.split(z)).x)
         d = max(d, _agree("alone", alone, r, z, e), _agree("in another order", residual(z[::2]), r[::2], z[::2], e))
-    how = "asked again alone, some after a close neighbour, and half of them in another order,"
-    return f"{count} measured rows, {how} {agreed(d)}"
+    how = "asked again alone, some after a close neighbour, and half of them in another order"
+    return f"{count} measured rows, {how}, {agreed(d)}"
 
 
 def _alone(backend: System, z: Array, domain: Domain) -> Array:
@@ -58,9 +58,9 @@ def _agree(how: str, answers: Array, r: Array, z: Array, e: Array) -> float:
     if (d <= allowed(e, d)).all():
         return float(d.max(initial=0.0))
     k = int(np.argmax((d / np.maximum(allowed(e, d), np.finfo(float).tiny)).max(axis=1)))
-    many = int((d > allowed(e, d)).any(axis=1).sum())
+    count = int((d > allowed(e, d)).any(axis=1).sum())
     raise UsageError(
-        f"certify: f̂ − f is not a function of (x, u): {many} of {len(d)} measured rows, asked again {how}, differ by up to "
+        f"certify: f̂ − f is not a function of (x, u): {count} of {len(d)} measured rows, asked again {how}, differ by up to "
         f"{d.max():.3g}, and rounding allows {e.max():.2g}; worst at (x, u) = {z[k].tolist()}: measured {r[k].tolist()}, now "
         f"{answers[k].tolist()}; make the backend restore its whole state before every query, and answer a row alike alone and "
         f"beside others"

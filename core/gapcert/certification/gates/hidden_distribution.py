@@ -135,27 +135,32 @@ def change(system: System, a: Array, b: Array) -> Array:
 
 
 class Law(ABC):
-    """A distribution of the hidden state, which may depend on x."""
+    """A distribution of the hidden state, which may depend on x; its draws keep columns `index` between `low` and `high`."""
+
+    low: Array
+    high: Array
+    index: Any = slice(None)
 
     @abstractmethod
     def draw(self, key: Keys, x: Array) -> Array:
         """(n, nh): one draw per row, by its key alone."""
 
-    @abstractmethod
     def extremes(self, x: Array, count: int) -> list[Array]:
-        """About `count` alternatives (n, nh) at the same x, which span the distribution's support."""
+        """About `count` alternatives (n, nh) at the same x, which span the distribution's support; here, draws."""
+        return [self.draw(keys(k, x), x) for k in range(count)]
 
-    @abstractmethod
     def outside(self, hidden: Array) -> Bools:
         """(n,): which hidden states certainly lie outside what draws can reach, since they leave its box."""
+        h = hidden[:, self.index]
+        return np.asarray(((h < self.low) | (h > self.high)).any(axis=1))
 
     @abstractmethod
     def describe(self) -> str:
         """The distribution in words, after `hidden state`."""
 
-    @abstractmethod
     def follows(self) -> str:
         """What is assumed, besides, of a law that depends on x: constants are those under a common hidden state."""
+        return ""
 
     @abstractmethod
     def digest(self) -> str:
@@ -202,15 +207,8 @@ class Ranges(Law):
             out.append(h)
         return out
 
-    def outside(self, hidden: Array) -> Bools:
-        h = hidden[:, self.index]
-        return np.asarray(((h < self.low) | (h > self.high)).any(axis=1))
-
     def describe(self) -> str:
         return "uniform on " + " × ".join(f"{n} ∈ [{low:g}, {high:g}]" for n, (low, high) in self.ranges.items())
-
-    def follows(self) -> str:
-        return ""
 
     def digest(self) -> str:
         return json_digest("ranges", self.ranges, self.base)
@@ -250,9 +248,6 @@ class Visited(Law):
         index = self.nearest(x)
         return [self.pool.h[index[:, k]] for k in range(self.near)]
 
-    def outside(self, hidden: Array) -> Bools:
-        return np.asarray(((hidden < self.low) | (hidden > self.high)).any(axis=1))
-
     def describe(self) -> str:
         return f"that of one of the {self.near} nearest of {len(self.pool)} states visited in rollouts"
 
@@ -271,7 +266,7 @@ class Visited(Law):
 
 @final
 class Around(Law):
-    """Of hidden state that seemed harmless: its default, as long rollouts leave it, or moved from its default, a third each."""
+    """Hidden state that seemed harmless: at its default, as long rollouts leave it, or moved, a third each."""
 
     def __init__(self, system: System, domain: Domain, ranges: Mapping[str, Range], seed: int) -> None:
         met = visited(system, domain, THRESHOLDS.harmless_runs, THRESHOLDS.harmless_steps, seed, long=True).h
@@ -281,24 +276,16 @@ class Around(Law):
             if spec.kind == "quaternion":
                 far[:, part] /= np.linalg.norm(far[:, part], axis=1, keepdims=True)
         self.pool = np.vstack([base, met if len(met) else base, far])
+        self.low, self.high = self.pool.min(axis=0), self.pool.max(axis=0)
 
     def draw(self, key: Keys, x: Array) -> Array:
         return np.asarray(self.pool[(uniforms(key, 1)[:, 0] * len(self.pool)).astype(np.intp)])
-
-    def extremes(self, x: Array, count: int) -> list[Array]:
-        return [np.tile(h, (len(x), 1)) for h in self.pool[:: max(1, len(self.pool) // count)]]
-
-    def outside(self, hidden: Array) -> Bools:
-        return np.asarray(((hidden < self.pool.min(axis=0)) | (hidden > self.pool.max(axis=0))).any(axis=1))
 
     def describe(self) -> str:
         return (
             f"in equal parts at its default, as rollouts of up to {THRESHOLDS.harmless_steps} steps leave it, and moved from "
             f"its default as the probe does"
         )
-
-    def follows(self) -> str:
-        return ""
 
     def digest(self) -> str:
         return json_digest("around", hashlib.sha256(self.pool.tobytes()).hexdigest())

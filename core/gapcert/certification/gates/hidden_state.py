@@ -98,8 +98,8 @@ class Gate:
     """What the gates found: `purity` and `turns` in words, `warnings`, and the branch that was taken with hidden state.
 
     `system` is what is sampled, `bound` (nx,) the spread that acts as further resolution; it cost `spent` transitions.
-    `first`: see `purity.answered`. `audited`, if set, is asked by the audit instead: hidden state that a
-    probe found harmless is drawn there all the same.
+    `audited`, if set, is asked by the audit instead: hidden state that a probe found harmless is drawn there all the same.
+    `first`: see `purity.answered`.
     """
 
     plan: HiddenPlan

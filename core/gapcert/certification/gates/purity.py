@@ -76,9 +76,8 @@ def purity(
 
     tell: hears each probe before the next one.
     """
-    rows = queries(system, domain, seed)
+    rows, first = answered(system, domain, seed)
     tell("asked once")
-    first = apart(system, rows, seed)
     if (lost := ~np.isfinite(first.x).all(axis=1)).any():
         k = int(np.argmax(lost))
         z = np.concatenate([rows.x[k], rows.u[k]])
@@ -91,7 +90,7 @@ def purity(
         d = max(d, _same(role, system, rows, first, index, answer, what))
         if len(answer.x) >= THRESHOLDS.purity_rows:
             tell(what)
-    # Company may change last bits, within e, as where loops are vectorised. The same call has the same bits at any time.
+    # Company may change last bits, within e, as where loops are vectorised; the same call has the same bits at any time.
     for what, asked in (
         ("asked again in the same call", system),
         ("asked of a fresh copy", pickle.loads(pickle.dumps(system))),
