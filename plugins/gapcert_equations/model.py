@@ -82,7 +82,7 @@ class EquationsModel(Model):
         return hashlib.sha256(b"gapcert_equations\n" + json.dumps(self.to_spec(), ensure_ascii=False).encode()).hexdigest()
 
     def _step(self, x: Array, u: Array, **options: Any) -> Step:
-        overrides, hidden, forces = (options.get(k) for k in ("parameters", "hidden", "forces"))
+        overrides, hidden, forces = options.get("parameters"), options.get("hidden"), options.get("forces")
         fixed = self._fix(ARRAY, overrides) if overrides else self._stated
         past = None if hidden is None else self._split(hidden)
         kicks: Any = None

@@ -388,17 +388,23 @@ class Monitor:
 
     def __init__(self, certified: Certified) -> None:
         axes(certified.model)
-        self._certified = certified
+        self._certified, zone = certified, certified.zone
+        # Where Z is a box in (x, u) itself, of no more than a turn, a point between its ends is in it as it stands.
+        whole = any(zone.high[j] - zone.low[j] > TURN for j, s in enumerate(certified.model.states) if s.kind == "angle")
+        plain = certified.relative is None and not zone.relations and not whole
+        self._ends = list(zip(zone.low, zone.high, strict=True)) if plain else []
         self.points = self.outside = self.violations = 0
 
     def step(self, x: Array, u: Array, x_next: Array) -> Observation:
         """x (nx,), u (nu,), held for the period, and x_next (nx,)."""
         at, given, after = (np.array(v, dtype=np.float64, ndmin=2) for v in (x, u, x_next))
         c = self._certified
-        z, r = c.points(at, given), c.residual(at, given, after)[0]
-        if not c.zone.contains(z)[0]:
-            self.outside += 1
-            return Observation(False, r, np.full(len(r), np.inf), False)
+        r, z = c.residual(at, given, after)[0], np.concatenate([at, given], axis=1)
+        if not (self._ends and all(a <= v <= b for v, (a, b) in zip(z[0].tolist(), self._ends, strict=True))):
+            z = c.points(at, given)
+            if not c.zone.contains(z)[0]:
+                self.outside += 1
+                return Observation(False, r, np.full(len(r), np.inf), False)
         low, high = c.band(z)
         gamma = np.maximum(np.abs(low[0]), np.abs(high[0]))
         # A value that is not a number does not confirm γ.

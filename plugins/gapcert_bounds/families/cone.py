@@ -26,7 +26,7 @@ class Cones:
 
     def __init__(self, z: Array, g: Array, lipschitz: Array) -> None:
         self._z, self._g, self._lipschitz = np.ascontiguousarray(z.T), np.ascontiguousarray(g.T), lipschitz
-        self._largest, self._columns = np.abs(g).max(axis=0), list(np.ascontiguousarray(lipschitz.T)[:, :, None])
+        self._largest, self._slopes = np.abs(g).max(axis=0), np.ascontiguousarray(lipschitz)[:, :, None]
         self._signed = np.stack([self._g, -self._g])
 
     def __call__(self, z: Array) -> tuple[Array, Array]:
@@ -46,9 +46,8 @@ class Cones:
         """(lower, upper), each (nx,), at one point z (nz,): to the same bits, for all states at once."""
         away = z[:, None] - self._z
         np.abs(away, out=away)
-        total = self._columns[0] * away[0]
-        for column, part in zip(self._columns[1:], away[1:], strict=True):
-            total += column * part
+        # Along an axis that is not the last, sums are made in order.
+        total = np.add.reduce(self._slopes * away, axis=1)
         # max g − t = −min (−g + t), without a rounding of its own.
         upper, lower = np.minimum.reduce(self._signed + total, axis=2)
         return -lower, upper
