@@ -34,7 +34,7 @@ from scipy.stats import binom
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "runs" / "redteam.jsonl"
-QUICK = {"certificates": 8, "games": 8, "mpc": 2, "networks": 20, "formulas": 300, "calibrations": 2, "forgeries": 10}
+QUICK = {"certificates": 8, "games": 8, "mpc": 2, "networks": 20, "formulas": 300, "calibrations": 2}
 SIGNIFICANT, USUAL = 1e-3, 0.99
 PATIENCE = 900
 """Seconds for one claim."""
@@ -83,7 +83,11 @@ def attack(wanted: Sequence[tuple[str, int, int]], tries: int | None, workers: i
             file.flush()
             if row["broken"] or row["claim"] == "error" or n % 50 == 0 or n == len(todo):
                 left = (time.monotonic() - began) / n * (len(todo) - n)
-                broke = f"; {row['kind']} {row['k']}: {row['claim']}, {row['broken']} of {row['tries']} break it" if row["broken"] else ""
+                broke = (
+                    f"; {row['kind']} {row['k']}: {row['claim']}, {row['broken']} of {row['tries']} break it"
+                    if row["broken"]
+                    else ""
+                )
                 print(f"{n} of {len(todo)}, some {left / 60:.0f} min left{broke}", file=sys.stderr, flush=True)
 
 
@@ -101,7 +105,10 @@ def above(row: dict[str, Any]) -> bool:
 
 def line(kind: str, rows: list[dict[str, Any]]) -> list[str]:
     """One line of the table."""
-    of = {claim: [r for r in rows if r["claim"] == claim] for claim in ("deterministic", "statistical", "empirical", "refused", "error")}
+    of = {
+        claim: [r for r in rows if r["claim"] == claim]
+        for claim in ("deterministic", "statistical", "empirical", "refused", "error")
+    }
     firm, stated = of["deterministic"], of["statistical"]
     high = sum(map(above, stated))
     may = int(binom.ppf(USUAL, len(stated), max((r["doubt"] or 0.0 for r in stated), default=0.0))) if stated else 0
@@ -111,7 +118,14 @@ def line(kind: str, rows: list[dict[str, Any]]) -> list[str]:
     return [kind, f"{len(rows):,}", f"{sum(r['tries'] for r in rows):,}", broken, level, others]
 
 
-HEAD = ["kind", "claims", "points, steps, words", "deterministic, broken", "statistical, above ε", "empirical / refused / error"]
+HEAD = [
+    "kind",
+    "claims",
+    "points, steps, words",
+    "deterministic, broken",
+    "statistical, above ε",
+    "empirical / refused / error",
+]
 
 
 def table(results: Path) -> str:
@@ -143,7 +157,14 @@ def main() -> int:
         attack(wanted, given.tries, given.workers, given.results)
     if given.json:
         rows = list(kept(given.results))
-        print(json.dumps({"machine": harness.machine(), "rows": [line(k, p) for k in KINDS if (p := [r for r in rows if r["kind"] == k])]}))
+        print(
+            json.dumps(
+                {
+                    "machine": harness.machine(),
+                    "rows": [line(k, p) for k in KINDS if (p := [r for r in rows if r["kind"] == k])],
+                }
+            )
+        )
     else:
         print(table(given.results))
     bad = [r for r in kept(given.results) if r["claim"] == "error" or (r["claim"] == "deterministic" and r["broken"])]

@@ -10,7 +10,7 @@ from typing import Any
 class Attempt:
     """One claim, attacked.
 
-    claim: what was claimed, or `refused`. tries: points, steps, words or forgeries; broken: those that contradict it. level: the
+    claim: what was claimed, or `refused`. tries: points, steps or words; broken: those that contradict it. level: the
     share ε that a statistical claim leaves, doubt: its β. drawn: of a claim with a level, tries as its audit draws them, and
     those that contradict it; the others were aimed. case: what was drawn, enough to see what it is about.
     """
@@ -31,6 +31,5 @@ KINDS = {
     "networks": 2000,
     "formulas": 10_000,
     "calibrations": 300,
-    "forgeries": 1000,
 }
 """Kind, which is the name of its module here → how many claims are drawn."""

@@ -16,7 +16,9 @@ STARTS = 200
 class Adversary(gc.System):
     """x⁺ = f(x, u) + d with d in [l, u](x, u). It remembers how often it was asked, and so is no simulator, only an opponent."""
 
-    def __init__(self, model: gc.Model, gap: gc.GapFunction, controller: gc.Controller, mode: str, rng: np.random.Generator) -> None:
+    def __init__(
+        self, model: gc.Model, gap: gc.GapFunction, controller: gc.Controller, mode: str, rng: np.random.Generator
+    ) -> None:
         self.states, self.inputs, self.period = model.states, model.inputs, model.period
         self.model, self.gap, self.controller, self.mode, self.rng, self.asked = model, gap, controller, mode, rng, 0
         self.corners = np.array(list(itertools.product((False, True), repeat=model.nx)))
@@ -71,7 +73,13 @@ def starts(controller: gc.Controller, n: int, rng: np.random.Generator) -> np.nd
 
 
 def fought(
-    model: gc.Model, gap: gc.GapFunction, controller: gc.Controller, wanted: int, steps: int, rng: np.random.Generator, runs: int = STARTS
+    model: gc.Model,
+    gap: gc.GapFunction,
+    controller: gc.Controller,
+    wanted: int,
+    steps: int,
+    rng: np.random.Generator,
+    runs: int = STARTS,
 ) -> tuple[int, int, dict[str, Any]]:
     """Steps made and runs that broke a promise, of at least `wanted` steps where they last; and the first break."""
     made, broken, first = 0, 0, dict[str, Any]()
@@ -80,7 +88,14 @@ def fought(
         x = starts(controller, runs, rng)
         if made >= wanted or not len(x):
             break
-        trace = gc.closed_loop(Adversary(model, gap, controller, mode, rng), controller, x, steps, controller.policies[k // 4 % len(controller.policies)], seed=k)
+        trace = gc.closed_loop(
+            Adversary(model, gap, controller, mode, rng),
+            controller,
+            x,
+            steps,
+            controller.policies[k // 4 % len(controller.policies)],
+            seed=k,
+        )
         lasted = np.isfinite(trace.u[..., 0]).sum(axis=1)
         wrong = trace.violation | trace.broken.any(axis=1)
         left = controller.left(x, controller.start(x)) if controller.goal.kind == "reach_avoid" else None

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from attacks import Attempt
 
 import gapcert as gc
+from attacks import Attempt
 
 POINTS = 40_000
 DOUBT = 0.1
@@ -23,15 +23,24 @@ def drawn(rng: np.random.Generator) -> dict[str, Any]:
         "integrator": "euler", "period": "0.1 s",
     }  # fmt: skip
     real = {**model, "derivative": {"x": "v", "v": str(rng.choice(["a - c*v - k*x", "a - c*v - k*abs(x)", "a - k*abs(x)"]))}}
-    noises = {"sensor_noise": {"x": f"{rng.uniform(0.1, 5)!r} mm"}, "jitter": f"{rng.uniform(0.1, 5)!r} ms", "parameters": {"c": [0.8, 1.2]}}
+    noises = {
+        "sensor_noise": {"x": f"{rng.uniform(0.1, 5)!r} mm"},
+        "jitter": f"{rng.uniform(0.1, 5)!r} ms",
+        "parameters": {"c": [0.8, 1.2]},
+    }
     chosen = [n for n in noises if rng.random() < 0.6] or ["jitter"]
     family = str(rng.choice(["envelope", "constant"]))
-    asked = {"claim": "statistical", "route": "calibrate", "violation": float(rng.choice([0.01, 0.05, 0.2])), "confidence": 1 - DOUBT}
+    asked = {
+        "claim": "statistical",
+        "route": "calibrate",
+        "violation": float(rng.choice([0.01, 0.05, 0.2])),
+        "confidence": 1 - DOUBT,
+    }
     return {
         "version": 1, "name": "drawn", "model": model, "seed": int(rng.integers(2**31)),
         "backend": {"kind": "stochastic", "of": real, **{n: noises[n] for n in chosen}},
         "domain": {"x": [-1, 1], "v": [-1, 1], "a": [-2, 2]}, "gap": {"kind": family},
-        "certificate": {**asked, "exceedances": int(rng.choice([0, 3, 10]))}, 
+        "certificate": {**asked, "exceedances": int(rng.choice([0, 3, 10]))},
     }  # fmt: skip
 
 
@@ -49,4 +58,6 @@ def attempt(rng: np.random.Generator, folder: Path, tries: int = POINTS) -> Atte
     low, high = certificate.gap.interval(z)
     wrong = int((~((low <= r) & (r <= high)).all(axis=1)).sum())
     claim = certificate.claim
-    return Attempt(claim.kind if certificate.holds else "refused", tries, wrong, claim.epsilon, claim.beta, (tries, wrong), case)
+    return Attempt(
+        claim.kind if certificate.holds else "refused", tries, wrong, claim.epsilon, claim.beta, (tries, wrong), case
+    )

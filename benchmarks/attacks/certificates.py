@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from attacks import Attempt
 
 import gapcert as gc
+from attacks import Attempt
 from gapcert.contracts.gaps.lipschitz import Residual
 
 POINTS = 50_000
@@ -28,7 +28,7 @@ def term(rng: np.random.Generator, low: float, high: float, size: float) -> str:
     t = f"({w!r}*(p - ({c!r})))"
     kinds = (
         f"abs({t})", f"max({t}, 0)", f"min({t}, 0.3)", f"sin({t})", f"cos({t})*sin(v)", f"tanh({t})", f"{t}**2", f"{t}**3",
-        f"exp(-{t}**2)", f"(1/(1 + {t}**2))", f"sqrt(1 + {t}**2)", f"abs({t})**1.5", f"u*abs(u)", f"v*{t}", f"((1e8 + {t}) - 1e8)",
+        f"exp(-{t}**2)", f"(1/(1 + {t}**2))", f"sqrt(1 + {t}**2)", f"abs({t})**1.5", "u*abs(u)", f"v*{t}", f"((1e8 + {t}) - 1e8)",
         f"sign({t})*{t}", f"log(1 + {t}**2)",
     )  # fmt: skip
     return f"({a!r})*{kinds[rng.integers(len(kinds))]}"
@@ -43,10 +43,10 @@ def drawn(rng: np.random.Generator) -> dict[str, Any]:
     gap = " + ".join(term(rng, low, high, size) for _ in range(rng.integers(1, 4)))
     model = {
         "kind": "equations", "states": {"p": "1", "v": "1"}, "inputs": {"u": "1"}, "parameters": {"T": "1 s"},
-        "derivative": {"p": f"({plain})/T", "v": f"(u - 0.5*v)/T"}, "period": "100 ms",
+        "derivative": {"p": f"({plain})/T", "v": "(u - 0.5*v)/T"}, "period": "100 ms",
         "integrator": str(rng.choice(["euler", "semi_implicit", "rk4"])), "substeps": int(rng.choice([1, 1, 3])),
     }  # fmt: skip
-    backend = {**model, "derivative": {"p": f"({plain} + {gap})/T", "v": f"(u - 0.5*v)/T"}}
+    backend = {**model, "derivative": {"p": f"({plain} + {gap})/T", "v": "(u - 0.5*v)/T"}}
     constants = str(rng.choice(["interval", "interval", "piecewise", "wood-zhang"]))
     family = str(rng.choice(["constant", "envelope", "envelope", "multilinear", "basis", "neural"]))
     fit = {"basis": {"functions": FUNCTIONS}, "neural": TRAINED}.get(family, {})

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from attacks import Attempt
 
 import gapcert as gc
+from attacks import Attempt
 from gapcert_cells.ltl import automaton_of
 
 WORDS = 50
@@ -76,6 +76,8 @@ def attempt(rng: np.random.Generator, folder: Path, tries: int = WORDS) -> Attem
         automaton = automaton_of(text(f))
     except gc.GapcertError as error:
         nothing = "accepts nothing" in str(error)
-        return Attempt("deterministic" if nothing else "refused", tries, sum(meant) if nothing else 0, case={"formula": text(f)})
+        return Attempt(
+            "deterministic" if nothing else "refused", tries, sum(meant) if nothing else 0, case={"formula": text(f)}
+        )
     wrong = sum(accepted(automaton, *lasso) != want for lasso, want in zip(lassos, meant, strict=True))
     return Attempt("deterministic", tries, wrong, case={"formula": text(f)})

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from attacks import Attempt
-from attacks.adversary import fought
 
 import gapcert as gc
+from attacks import Attempt
+from attacks.adversary import fought
 
 STEPS = 100_000
 FORMULAS = ("G F a & G F b", "F (a & F b)", "F a & G !b", "!b U a", "G (a | b)", "F G a")
@@ -29,7 +29,12 @@ def model(rng: np.random.Generator) -> tuple[dict[str, Any], np.ndarray, np.ndar
     angle = kind >= 2
     turn = kind == 3 or (kind == 2 and rng.random() < 0.5)
     w = "(v*S/R)" if angle else "v"
-    v = [f"{a!r}*u", f"{a!r}*u - {b!r}*{w} - {c!r}*{w}*abs({w})", f"{a!r}*u - {c!r}*sin(p)", f"{a!r}*u - {b!r}*{w} + {c!r}*cos(2*p)"][kind]
+    v = [
+        f"{a!r}*u",
+        f"{a!r}*u - {b!r}*{w} - {c!r}*{w}*abs({w})",
+        f"{a!r}*u - {c!r}*sin(p)",
+        f"{a!r}*u - {b!r}*{w} + {c!r}*cos(2*p)",
+    ][kind]
     low, high = (-np.pi, np.pi) if turn else (-float(rng.uniform(0.5, 2)), float(rng.uniform(0.5, 2)))
     if turn and rng.random() < 0.5:
         low, high = low + 2 * np.pi * int(rng.integers(-3, 4)) + 0.3, high + 0.3
@@ -51,7 +56,11 @@ def drawn(rng: np.random.Generator) -> dict[str, Any]:
     avoid = [shape(rng, low, high, 0.02, 0.2) for _ in range(rng.integers(0, 3))]
     goal: dict[str, Any] = {kind: {"target": box, **({"avoid": avoid} if avoid else {})}}
     if kind == "invariance":
-        goal = {kind: shape(rng, low, high, 0.6, 1.0) if rng.random() < 0.5 else dict(zip("pv", np.stack([low, high], 1).tolist(), strict=True))}
+        goal = {
+            kind: shape(rng, low, high, 0.6, 1.0)
+            if rng.random() < 0.5
+            else dict(zip("pv", np.stack([low, high], 1).tolist(), strict=True))
+        }
     if kind == "ltl":
         goal = {kind: str(rng.choice(FORMULAS)), "regions": {"a": box, "b": shape(rng, low, high, 0.2, 0.5)}}
     refine = int(rng.integers(1, 3)) if rng.random() < 0.3 else 0

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from attacks import Attempt
-from attacks.adversary import fought
 
 import gapcert as gc
+from attacks import Attempt
+from attacks.adversary import fought
 
 STEPS = 5000
 RUNS = 10
@@ -38,7 +38,12 @@ def options(rng: np.random.Generator, kind: str, mass: float) -> dict[str, Any]:
     if rng.random() < 0.3:
         chosen |= pool[rng.integers(len(pool))]
     reference = {"reference": {"p": float(rng.uniform(-0.5, 0.5))}} if kind == "invariance" and rng.random() < 0.7 else {}
-    return {**chosen, **reference, "horizon": int(rng.integers(6, 25)), "solver": str(rng.choice(["auto", "osqp", "piqp", "clarabel"]))}
+    return {
+        **chosen,
+        **reference,
+        "horizon": int(rng.integers(6, 25)),
+        "solver": str(rng.choice(["auto", "osqp", "piqp", "clarabel"])),
+    }
 
 
 def drawn(rng: np.random.Generator) -> dict[str, Any]:

@@ -6,10 +6,10 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from attacks import Attempt
 from scipy.special import expit
 
 import gapcert_networks
+from attacks import Attempt
 from gapcert_lipsdp.lipsdp import LipSDP
 
 POINTS = 20_000

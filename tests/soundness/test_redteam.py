@@ -45,7 +45,9 @@ def made(draw, rng, folder):
     """The first drawn spec that gives a claim."""
     for k in range(40):
         try:
-            run = gc.run(draw(rng), overrides=("report.html=false", "report.rerun=false"), out=folder / str(k), executor="threads")
+            run = gc.run(
+                draw(rng), overrides=("report.html=false", "report.rerun=false"), out=folder / str(k), executor="threads"
+            )
         except gc.GapcertError:
             continue
         if run.summary["verdict"] == "holds":
@@ -109,7 +111,9 @@ def test_a_gap_that_a_controller_was_not_told_of_is_found(tmp_path):
 
 
 def test_a_slope_above_its_constant_is_found(monkeypatch, tmp_path):
-    monkeypatch.setattr(networks.LipSDP, "bound", lambda self, net, units: dataclasses.make_dataclass("B", [("value", float, 1e-3)])())
+    monkeypatch.setattr(
+        networks.LipSDP, "bound", lambda self, net, units: dataclasses.make_dataclass("B", [("value", float, 1e-3)])()
+    )
     assert any(networks.attempt(np.random.default_rng(k), tmp_path, 500).broken for k in range(3))
 
 
