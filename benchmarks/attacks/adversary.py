@@ -1,4 +1,4 @@
-"""Whoever chooses the gap against a controller: corners of [l, u], kept, alternating, at random or greedily, snapped to cell edges."""
+"""Whoever chooses the gap against a controller: corners of [l, u], kept, alternating, at random or greedily, snapped to edges."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ STARTS = 200
 
 
 class Adversary(gc.System):
-    """x⁺ = f(x, u) + d with d in [l, u](x, u). It remembers how often it was asked, and so is no simulator, only an opponent."""
+    """x⁺ = f(x, u) + d with d in [l, u](x, u). It remembers how often it was asked: no simulator, only an opponent."""
 
     def __init__(
         self, model: gc.Model, gap: gc.GapFunction, controller: gc.Controller, mode: str, rng: np.random.Generator

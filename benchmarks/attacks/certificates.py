@@ -1,4 +1,7 @@
-"""Certificates of hard texts: kinks, steep waves, powers at 0, cancellation, scales from 1e-8 to 1e8, offsets of 1e10; families × constants × routes."""
+"""Certificates of hard texts, by families × constants × routes.
+
+They have kinks, steep waves, powers at 0 and cancellation, at scales from 1e-8 to 1e8 and offsets of 1e10.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +31,8 @@ def term(rng: np.random.Generator, low: float, high: float, size: float) -> str:
     t = f"({w!r}*(p - ({c!r})))"
     kinds = (
         f"abs({t})", f"max({t}, 0)", f"min({t}, 0.3)", f"sin({t})", f"cos({t})*sin(v)", f"tanh({t})", f"{t}**2", f"{t}**3",
-        f"exp(-{t}**2)", f"(1/(1 + {t}**2))", f"sqrt(1 + {t}**2)", f"abs({t})**1.5", "u*abs(u)", f"v*{t}", f"((1e8 + {t}) - 1e8)",
+        f"exp(-{t}**2)", f"(1/(1 + {t}**2))", f"sqrt(1 + {t}**2)", f"abs({t})**1.5", "u*abs(u)", f"v*{t}",
+        f"((1e8 + {t}) - 1e8)",
         f"sign({t})*{t}", f"log(1 + {t}**2)",
     )  # fmt: skip
     return f"({a!r})*{kinds[rng.integers(len(kinds))]}"

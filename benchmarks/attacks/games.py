@@ -40,7 +40,8 @@ def model(rng: np.random.Generator) -> tuple[dict[str, Any], np.ndarray, np.ndar
         low, high = low + 2 * np.pi * int(rng.integers(-3, 4)) + 0.3, high + 0.3
         high = low + 2 * np.pi
     return {
-        "kind": "equations", "states": {"p": {"unit": "rad", "kind": "angle"} if angle else "1", "v": "rad/s" if angle else "1"},
+        "kind": "equations",
+        "states": {"p": {"unit": "rad", "kind": "angle"} if angle else "1", "v": "rad/s" if angle else "1"},
         "inputs": {"u": "1"}, "parameters": {"T": "1 s"} if not angle else {"S": "1 s", "R": "1 rad"},
         "derivative": {"p": "v", "v": f"({v})*R/S**2"} if angle else {"p": "v/T", "v": f"({v})/T"},
         "integrator": str(rng.choice(["euler", "semi_implicit", "rk4"])), "period": float(rng.uniform(0.1, 0.6)),
@@ -63,14 +64,16 @@ def drawn(rng: np.random.Generator) -> dict[str, Any]:
         }
     if kind == "ltl":
         goal = {kind: str(rng.choice(FORMULAS)), "regions": {"a": box, "b": shape(rng, low, high, 0.2, 0.5)}}
+    gamma = {n: float(w * rng.choice([0.0, 0.02, 0.1, 0.3])) for n, w in zip("pv", width, strict=True)}
+    cells = dict(zip("pv", counts.tolist(), strict=True))
     refine = int(rng.integers(1, 3)) if rng.random() < 0.3 else 0
     relations = ["abs(v + 0.5 rad/s*u) <= 1.2 rad/s"] if f["states"]["v"] != "1" else ["abs(v + 0.5*u) <= 1.2"]
     return {
         "version": 1, "name": "drawn", "model": f, "seed": 0,
         "domain": {"p": [float(low[0]), float(high[0])], "v": [float(low[1]), float(high[1])], "u": [-3, 3]},
-        "gap": {"kind": "declared", "gamma": {n: float(w * rng.choice([0.0, 0.02, 0.1, 0.3])) for n, w in zip("pv", width, strict=True)}},
+        "gap": {"kind": "declared", "gamma": gamma},
         **({"relations": relations} if rng.random() < 0.2 else {}),
-        "controller": {"kind": "symbolic", "goal": goal, "cells": dict(zip("pv", counts.tolist(), strict=True)), "inputs": {"u": int(rng.integers(3, 12))}, "refine": refine},
+        "controller": {"kind": "symbolic", "goal": goal, "cells": cells, "inputs": {"u": int(rng.integers(3, 12))}, "refine": refine},
     }  # fmt: skip
 
 

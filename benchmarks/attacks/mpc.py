@@ -21,7 +21,8 @@ def model(rng: np.random.Generator) -> tuple[dict[str, Any], float]:
     force = str(rng.choice(["u/m", "(u - b*v)/m", "(u - k*p)/m", "(u - k*l*sin(p/l))/m"]))
     values = {"m": f"{a!r} kg", "b": f"{b!r} kg/s", "k": f"{b!r} kg/s^2", "l": "1 m"}
     return {
-        "kind": "equations", "states": {"p": "m", "v": "m/s"}, "inputs": {"u": "N"}, "parameters": {n: v for n, v in values.items() if n in force},
+        "kind": "equations", "states": {"p": "m", "v": "m/s"}, "inputs": {"u": "N"},
+        "parameters": {n: v for n, v in values.items() if n in force},
         "derivative": {"p": "v", "v": force}, "integrator": str(rng.choice(["euler", "semi_implicit", "rk4"])),
         "period": f"{rng.uniform(0.05, 0.2)!r} s",
     }, a  # fmt: skip
@@ -30,7 +31,8 @@ def model(rng: np.random.Generator) -> tuple[dict[str, Any], float]:
 def options(rng: np.random.Generator, kind: str, mass: float) -> dict[str, Any]:
     """What makes the variants; some do not go together, and are refused then."""
     pool: list[dict[str, Any]] = [
-        {}, {}, {"linearisation": "successive"}, {"feedback": "disturbance"}, {"adapt": {"m": [f"{0.8 * mass!r} kg", f"{1.2 * mass!r} kg"]}},
+        {}, {}, {"linearisation": "successive"}, {"feedback": "disturbance"},
+        {"adapt": {"m": [f"{0.8 * mass!r} kg", f"{1.2 * mass!r} kg"]}},
         {"terminal": {"kind": "symbolic", "cells": {"p": 30, "v": 30}, "inputs": {"u": 7}}}, {"rates": {"u": "3 N"}},
         {"soft": {"v": {"range": [-0.3, 0.3]}}}, {"majorant": "constant"}, {"majorant": "affine"},
     ]  # fmt: skip

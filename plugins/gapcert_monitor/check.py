@@ -390,7 +390,7 @@ class Monitor:
         axes(certified.model)
         self._certified, zone = certified, certified.zone
         # Where Z is a box in (x, u) itself, of no more than a turn, a point between its ends is in it as it stands.
-        whole = any(zone.high[j] - zone.low[j] > TURN for j, s in enumerate(certified.model.states) if s.kind == "angle")
+        whole = any(zone.high[j] - zone.low[j] > circle.TURN for j, s in enumerate(certified.model.states) if s.kind == "angle")
         plain = certified.relative is None and not zone.relations and not whole
         self._ends = list(zip(zone.low, zone.high, strict=True)) if plain else []
         self.points = self.outside = self.violations = 0
