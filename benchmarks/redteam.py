@@ -6,8 +6,8 @@
 
 Kinds are the modules of `attacks`. Deterministic claims may not break at all. Of a statistical one (ε, β) the share of violated
 points, drawn as its audit draws, may be significantly above ε (one-sided binomial test, 1e-3) in no more claims than β allows
-(0.99 quantile of a binomial distribution). Claim k of a seed is always the same. Each is kept as a line of JSON with the
-commit that it was asked of, and asked again at another one. An attempt that ends in anything but a claim or a reason is an error.
+(0.99 quantile of a binomial distribution). Claim k of a seed is always the same. Each is kept as a line of JSON with
+the commit that it was asked of, and asked again at another one. An attempt that ends in neither claim nor reason is an error.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Whoever chooses the gap against a controller: corners of [l, u], kept, alternating, at random or greedily, snapped to edges."""
+"""Whoever chooses the gap against a controller: corners of [l, u], kept, alternating, at random or greedily, at edges."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Calibrated bands of stochastic simulators: how much of what is drawn later they leave out, against the level that they state."""
+"""Calibrated bands of stochastic simulators: how much of what is drawn later they leave out, against their level."""
 
 from __future__ import annotations
 

@@ -66,6 +66,7 @@ def drawn(rng: np.random.Generator) -> dict[str, Any]:
         goal = {kind: str(rng.choice(FORMULAS)), "regions": {"a": box, "b": shape(rng, low, high, 0.2, 0.5)}}
     gamma = {n: float(w * rng.choice([0.0, 0.02, 0.1, 0.3])) for n, w in zip("pv", width, strict=True)}
     cells = dict(zip("pv", counts.tolist(), strict=True))
+    inputs = {"u": int(rng.integers(3, 12))}
     refine = int(rng.integers(1, 3)) if rng.random() < 0.3 else 0
     relations = ["abs(v + 0.5 rad/s*u) <= 1.2 rad/s"] if f["states"]["v"] != "1" else ["abs(v + 0.5*u) <= 1.2"]
     return {
@@ -73,7 +74,7 @@ def drawn(rng: np.random.Generator) -> dict[str, Any]:
         "domain": {"p": [float(low[0]), float(high[0])], "v": [float(low[1]), float(high[1])], "u": [-3, 3]},
         "gap": {"kind": "declared", "gamma": gamma},
         **({"relations": relations} if rng.random() < 0.2 else {}),
-        "controller": {"kind": "symbolic", "goal": goal, "cells": cells, "inputs": {"u": int(rng.integers(3, 12))}, "refine": refine},
+        "controller": {"kind": "symbolic", "goal": goal, "cells": cells, "inputs": inputs, "refine": refine},
     }  # fmt: skip
 
 

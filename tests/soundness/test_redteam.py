@@ -61,7 +61,7 @@ class Narrow(gc.GapFunction):
     family = "narrow"
 
     def __init__(self, gap, share):
-        self.gap, self.share, self.nx = gap, share, gap.nx
+        self.gap, self.share = gap, share
 
     def interval(self, z):
         low, high = self.gap.interval(z)
