@@ -229,7 +229,9 @@ def _either(first: Array, second: Array, a: Slopes, b: Slopes) -> Slopes:
 
 
 _QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\d\s.+-].*?|1\s*/.*?)?\s*")
-_UNIT = re.compile(r"(?:[^\W\d_]+|[%°*/() .-]|(?<=[^\W\d])\d{1,2}|(?<=[*^(-])\d{1,2}|\^|1(?=\s*/)){1,60}")
+# Pint computes powers of numbers while it reads: only a name or a bracket may have an exponent, a short one.
+_POWER = re.compile(r"(?<=[^\W\d_]|[)%°])\s*(?:\*\*|\^)\s*\(?-?\d{1,2}(?:[./]\d)?\)?(?!\s*(?:\*\*|[\^\w.]))")
+_PLAIN = re.compile(r"(?:1(?=\s*/))?(?:[^\W\d_]|[%°/() .-]|\*(?!\*)){0,60}")
 
 
 def quantity(value: Any) -> tuple[float, float]:
@@ -251,7 +253,7 @@ def _factor(unit: str) -> float:
     """To the coherent SI unit."""
     if unit in ("", "1"):
         return 1.0
-    if _UNIT.fullmatch(unit) is None:
+    if len(unit) > 80 or _PLAIN.fullmatch(_POWER.sub("", unit)) is None:
         raise ValueError(f"unit '{unit[:60]}' is not known")
     import pint
 
