@@ -274,7 +274,9 @@ def conclude(
 ) -> Certificate:
     """Evidence and the strongest claim, of those asked for, that the evidence allows."""
     route, request, model = question.route, question.request, question.model
-    refuted = route.refuted(problem, gap) or contradiction.by_audit(problem, audited.z, audited.r)
+    refuted = route.refuted(problem, gap)
+    if refuted is None and record is None and route.constants:  # else the claim rests on points alone, or on γ as declared
+        refuted = contradiction.by_audit(problem, audited.z, audited.r)
     gate = hidden_state.attacked(gate, gap, problem, model, store.emit)
     attacked = attack(gap, store.residual, problem.domain, request.attack, problem.seed, store.emit) if request.attack else {}
     if record is not None and attacked:
@@ -283,7 +285,7 @@ def conclude(
     drawn = f"uniform on {problem.domain.words}{gate.distribution}{'' if record is None else record.draws}"
     constant, envelope = route.yardsticks(gap, problem, record, audited.z)
     over = refuted is not None or points_refute(audited, attacked, gate)
-    if not over:
+    if not over and record is None:
         contradiction.declared(problem, gap, store.residual, route.claim == "assumed")
     return Certificate(
         gap,
