@@ -293,7 +293,9 @@ def conclude(
 ) -> Certificate:
     """Evidence and the strongest claim, of those asked for, that the evidence allows."""
     route, request, model = question.route, question.request, question.model
-    refuted = route.refuted(problem, gap) or (contradiction.by_audit(problem, audited.z, audited.r) if record is None else None)
+    refuted = route.refuted(problem, gap)
+    if refuted is None and record is None and route.constants:  # else the claim rests on points alone, or on γ as declared
+        refuted = contradiction.by_audit(problem, audited.z, audited.r)
     moved = partial(ledger.enter, question.identity, "hidden state", f"{gap_digest(gap, problem)}:{store.key}")
     gate = hidden_state.attacked(gate, gap, problem, model, moved, store.emit)
     fresh = audited.entry.draws(problem.seed, "attack")
@@ -304,7 +306,7 @@ def conclude(
     drawn = f"uniform on {problem.domain.words}{gate.distribution}{'' if record is None else record.draws}"
     constant, envelope = route.yardsticks(gap, problem, record, audited.z)
     over = refuted is not None or points_refute(audited, attacked, gate)
-    if not over:
+    if not over and record is None:
         contradiction.declared(problem, gap, store.residual, route.claim == "assumed")
     return Certificate(
         gap,
