@@ -149,8 +149,8 @@ class Fingerprint:
             from scipy.optimize import linprog
 
             rows, box = np.eye(len(zone.low)), list(zip(zone.low, zone.high, strict=True))
-            found = [[linprog(s * row, zone.matrix, zone.bounds, bounds=box).x @ row for row in rows] for s in (1, -1)]
-            ends = np.array(found)
+            solved = [[linprog(s * row, zone.matrix, zone.bounds, bounds=box).x for row in rows] for s in (1, -1)]
+            ends = np.array(solved, dtype=np.float64).diagonal(axis1=1, axis2=2)
         return np.asarray(ends * self._unit)
 
     def _inside(self, ends: Array, order: Sequence[int]) -> Bools:
