@@ -338,6 +338,7 @@ def test_what_was_drawn_by_the_older_rule_is_verified_by_it_and_told(tmp_path: P
     (tmp_path / "ledger.json").write_text(json.dumps({first.audit.entry.question: [text]}))
     c = certified(tmp_path, 0, asked)
     assert (c.audit.k, "book" in c.summary()["audit"]) == (1, False)
+    assert "is of a book before format 2" in " ".join(c.summary()["warnings"])
     told = verify_run(tmp_path / "run0")
     assert told["verdict"] == "holds"
     assert any("by the rule before the book's format 2" in t for t in told["trusted"])

@@ -87,7 +87,9 @@ class Fingerprint:
     def _far(self, old: Known, order: Sequence[int], rows: int) -> Bools:
         """(nx, nx): at the first points of `old`, whose axis order[i] is axis i, state i is not its state j, by over 4 e."""
         states = self._axes[: old["e"].shape[1]]
-        d = self._answers(self._whole(old["z"][:rows, list(order)]))[:, :, states, None] - old["values"][:, :rows, None]
+        # All points are asked: a draw belongs to its row, and a spread is that of all.
+        found = self._answers(self._whole(old["z"][:, list(order)]))[:, :rows, states, None]
+        d = found - old["values"][:, :rows, None]
         turns = np.round(d / (2 * np.pi)) * np.array([[self.domain.axes[i].kind == "angle"] for i in states])
         e = np.maximum(self.known["e"][:, None, :, None], old["e"][:, None, None])
         return np.asarray((np.abs(d - 2 * np.pi * turns) > 4 * e).any(axis=(0, 1)))
@@ -149,8 +151,8 @@ class Fingerprint:
             from scipy.optimize import linprog
 
             rows, box = np.eye(len(zone.low)), list(zip(zone.low, zone.high, strict=True))
-            found = [[linprog(s * row, zone.matrix, zone.bounds, bounds=box).x @ row for row in rows] for s in (1, -1)]
-            ends = np.array(found)
+            solved = [[linprog(s * row, zone.matrix, zone.bounds, bounds=box).x for row in rows] for s in (1, -1)]
+            ends = np.array(solved, dtype=np.float64).diagonal(axis1=1, axis2=2)
         return np.asarray(ends * self._unit)
 
     def _inside(self, ends: Array, order: Sequence[int]) -> Bools:

@@ -53,7 +53,9 @@ class Entry:
 
     @property
     def warnings(self) -> list[str]:
-        """What is wrong with the book."""
+        """What is wrong with the book, or with what it has of this audit."""
+        if not self.question:
+            return [f"audit {self.k} is of a book before format {FORMAT}, whose rule of drawing lets a fit know its points"]
         lost = f"lacks {self.lost} that run folders beside it tell of, so that it was lost or replaced" if self.lost else ""
         told = " and ".join(filter(None, (lost, "was edited" if self.edited else "")))
         return [f"the book of audits {told}; what nothing else tells of is not counted"] if told else []
