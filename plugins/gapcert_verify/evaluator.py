@@ -280,7 +280,7 @@ class Reader:
         return self._read(ast.parse(re.sub(r"\s", " ", text).strip(), mode="eval").body)
 
     def _read(self, node: ast.expr) -> Term:
-        if isinstance(node, ast.Constant) and type(node.value) in (int, float):
+        if isinstance(node, ast.Constant) and isinstance(node.value, int | float) and not isinstance(node.value, bool):
             value = float(node.value)
             exact = isinstance(node.value, float) or abs(node.value) <= 2**53
             return self.tape.number(value) if exact else self.tape.number(float(ar.down(value)), float(ar.up(value)))
@@ -320,7 +320,7 @@ class Reader:
 
 def _folded(node: ast.expr) -> float | None:
     """The value of an exponent that is numbers alone."""
-    if isinstance(node, ast.Constant) and type(node.value) in (int, float):
+    if isinstance(node, ast.Constant) and isinstance(node.value, int | float) and not isinstance(node.value, bool):
         return float(node.value)
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.UAdd | ast.USub):
         inner = _folded(node.operand)

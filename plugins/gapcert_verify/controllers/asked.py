@@ -46,7 +46,8 @@ class Asked:
             avoid = self._region(given["avoid"]) if given.get("avoid") else None
             return Goal("automaton", self._box(given.get("stay") or {}), None, avoid, read, own)
         avoid = self._region(part["avoid"]) if part.get("avoid") else None
-        return Goal(kind, self._box(part.get("stay") or {}), self._region(part["target"]), avoid)
+        targeted: Any = kind
+        return Goal(targeted, self._box(part.get("stay") or {}), self._region(part["target"]), avoid)
 
     @property
     def cuts(self) -> list[str]:

@@ -94,7 +94,7 @@ def _height(values: Ints) -> Small:
 
 
 def _part(cells: Cells, c: GridController, safe: Bools, wrong: Bools, ends: Bools, limit: Ints, memory: str = "") -> Part | str:
-    values, size = np.asarray(c.values), cells.size
+    values, size = np.asarray(c.values, dtype=np.int64), cells.size
     if values.shape != (size,) or c.bits.shape != (size, (len(c.points) + 7) // 8) or c.bits.dtype != np.uint8:
         return f"there are values of shape {values.shape} and inputs of {c.bits.shape} for {size} cells"
     wins, allows = values >= 0, c.bits.any(axis=1)
@@ -114,12 +114,12 @@ def figures(cells: Cells, controller: GridController | AutomatonController) -> d
     """What `evidence` says of cells, counted again: those that win with the memory that a run begins with."""
     if isinstance(controller, AutomatonController):
         wins, a = np.ones(cells.size, dtype=bool), controller.automaton
-        won = np.stack([np.asarray(p.values) >= 0 for p in controller.parts])
+        won = np.stack([np.asarray(p.values, dtype=np.int64) >= 0 for p in controller.parts])
         for letter, q in enumerate(a.after[a.start]):
             read = ((controller.must & ~letter) == 0) & ((letter & ~controller.may) == 0)
             wins &= ~read | (won[q] if q >= 0 else False)
     else:
-        wins = np.asarray(controller.values) >= 0
+        wins = np.asarray(controller.values, dtype=np.int64) >= 0
     splits = controller.parts[0].splits if isinstance(controller, AutomatonController) else controller.splits
     wins &= cells.whole
     share: Array = np.ones(cells.size) / cells.size if splits is None else splits.shares()

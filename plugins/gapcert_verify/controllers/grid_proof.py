@@ -68,7 +68,8 @@ class Proof:
             if not len(own):
                 continue
             allowed = np.unpackbits(part.bits[level.node[own]], axis=1, count=len(self.points))
-            pairs = np.nonzero(allowed)
+            cell, choice = np.nonzero(allowed)
+            pairs = np.asarray(cell, dtype=np.int64), np.asarray(choice, dtype=np.int64)
             if text := self._outside(level, own, pairs):
                 return text
             left = np.flatnonzero(height.over(*windows.of(own, pairs)) > part.limit[level.node[own[pairs[0]]]])

@@ -373,7 +373,7 @@ class Saved:
 
 def _losing(cells: Cells, boxes: Sequence[Box]) -> str:
     """Boxes in which plans end lie in cells that win; none may be there where they end so."""
-    values = np.asarray(cells.controller.values)
+    values = np.asarray(cells.controller.values, dtype=np.int64)
     (height,) = cells.heights(np.where(values < 0, BEYOND, 0).astype(np.int32)) if len(cells.levels) == 1 else (None,)
     if height is None:
         return "what takes over from its plans has halved cells"
