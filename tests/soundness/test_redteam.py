@@ -129,6 +129,7 @@ def test_words_of_known_truth():
     assert {f: bool(formulas.truth(f, word, 1)[0]) for f in says} == says
 
 
+@pytest.mark.contract
 def test_what_is_kept_is_not_asked_again(tmp_path, monkeypatch):
     rows = tmp_path / "rows.jsonl"
     redteam.attack([("formulas", 1, k) for k in range(3)], 5, 1, rows)
