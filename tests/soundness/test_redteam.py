@@ -14,8 +14,8 @@ import gapcert as gc
 from gapcert.contracts.gaps.lipschitz import Residual
 
 SEED = 11
-FEW = {"certificates": (4, 5000), "games": (4, 4000), "mpc": (2, 500), "networks": (4, 3000), "formulas": (60, 20)}
-MORE = {"certificates": 40, "games": 30, "mpc": 15, "networks": 60, "formulas": 1000, "calibrations": 10}
+FEW = {"networks": (4, 3000), "formulas": (60, 20)}
+MORE = {"certificates": 16, "games": 12, "mpc": 4, "networks": 40, "formulas": 1000, "calibrations": 4}
 
 
 def broken(kind: str, first: int, claims: int, tries: int | None) -> list[dict]:
