@@ -30,6 +30,7 @@ def failures(run):
     return {c["check"]: c["detail"] for c in verify_run(run)["checks"] if not c["passed"]}
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("name", planned())
 def test_honest_plans_are_proved(runs, name):
     answer = verify_run(runs[name])
@@ -112,6 +113,7 @@ FORGERIES = {
 }
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("name", FORGERIES)
 def test_changed_plans_fail(runs, tmp_path, name):
     of, change, check = FORGERIES[name]
