@@ -64,7 +64,7 @@ class Copies:
             found |= new
         titles = _titles(recording.trajectories)
         told = []
-        for (a, b), k in found.items():
+        for (a, b), k in sorted(found.items(), key=lambda item: (item[0][1], item[1][0])):
             tr = recording.trajectories[b]
             told.append(Copy(titles[b], titles[a], float(tr.t[k[0]]), len(k), len(k) == len(tr)))
         return cls(tuple(told), rows)

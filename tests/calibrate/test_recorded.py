@@ -209,7 +209,7 @@ def test_what_was_measured_once_is_one_unit() -> None:
     once = gc.calibrate_recording(model, log, domain, **options)
     many = gc.calibrate_recording(model, gc.Recording(cut + log.trajectories + rounded + cut), domain, **options)
     assert (many.units, many.rank) == (once.units, once.rank) == (45, 30)
-    assert "'later 0' is a copy of" in many.assumptions[-1]
+    assert "'0 (1)' is a copy of '0 (46)'" in many.assumptions[-1]
     assert "and 125 more" in many.assumptions[-1]
     assert sum("counted once" in w for w in many.warnings) == 11
     few = gc.Recording(recording(9).trajectories * 5)
