@@ -64,7 +64,7 @@ class Copies:
             found |= new
         titles = _titles(recording.trajectories)
         told = []
-        for (a, b), k in found.items():
+        for (a, b), k in sorted(found.items(), key=lambda item: (item[0][1], item[1][0])):
             tr = recording.trajectories[b]
             told.append(Copy(titles[b], titles[a], float(tr.t[k[0]]), len(k), len(k) == len(tr)))
         return cls(tuple(told), rows)
@@ -124,6 +124,12 @@ class _Series:
         return float(np.mean(np.divide(self.quantum, size, out=np.zeros(size.shape), where=size > 0)))
 
     @cached_property
+    def clock(self) -> float:
+        """What the digits of the times leave open, in rows."""
+        period = float(np.median(np.diff(self.t)))
+        return float(_quantum(self.t, _form(self.t)).max()) / period if period > 0 else 0.0
+
+    @cached_property
     def moves(self) -> Bools:
         """(T, c): where a value is another than that of the row before."""
         there = np.isfinite(self.values)
@@ -141,11 +147,18 @@ class _Series:
         out = np.ones(self.values.shape[1])
         for j, v in enumerate(self.values.T):
             known = v[np.isfinite(v)]
-            unique = np.unique(known)
-            apart = np.diff(unique)[np.diff(unique) > 1e-9 * np.ptp(unique)] if len(unique) > 1 else np.zeros(0)
-            if len(apart):
-                out[j] += np.log2(1 + max(noise_floor(known), 0.0) / max(apart.min(), np.nanmedian(self.quantum[:, j])))
+            if (noise := noise_floor(known)) > 0:
+                out[j] += np.log2(1 + noise / max(_step(known), float(self.quantum[:, j].max())))
         return np.where(self.measured, out, 0.0)
+
+
+def _step(v: Array) -> float:
+    """The step of a lattice on which values (n,) lie, as counts do; 0 where they lie on none."""
+    unique = np.unique(v)
+    apart = np.diff(unique)
+    apart = apart[apart > 1e-9 * np.ptp(unique)] if len(apart) else apart
+    counts = apart / apart.min(initial=np.inf)
+    return float(apart.min()) if len(apart) and (np.abs(counts - np.round(counts)) < 1e-3).all() else 0.0
 
 
 def _form(v: Array) -> tuple[int, int, bool]:
@@ -156,8 +169,9 @@ def _form(v: Array) -> tuple[int, int, bool]:
         single = some.astype(np.float32)
     plain = _digits(some, 4 * _EPS * np.abs(some))
     # What was rounded first and written in single precision next, or the other way round, was both.
-    if (np.abs(single - some) <= _quantum(some, (*plain, False))).all():
-        behind, digits = _digits(some, 0.6 * np.spacing(np.abs(single)).astype(np.float64))
+    left, apart = _quantum(some, (*plain, False)), np.spacing(np.abs(single)).astype(np.float64)
+    if len(some) and (np.abs(single - some) <= left).all() and 4 * np.median(left) <= np.median(apart):
+        behind, digits = _digits(some, 0.6 * apart)
         return (behind, digits, True) if digits <= SINGLE_DIGITS else (17, 17, True)
     return *plain, False
 
@@ -341,7 +355,7 @@ def _equal(a: _Series, b: _Series, at: Array, known: Rows) -> Bools:
     one, two = a.quantum[low], b.quantum[known]
     rounded = np.where(alike, 0.0, one + two) + (_single(a, value) + _single(b, own))
     # Where rows lie between others, the digits of the times count as well.
-    clock = sum(float(_quantum(s.t, _form(s.t)).max()) for s in (a, b)) / float(np.median(np.diff(a.t)))
-    allowed = rounded + 8 * _EPS * np.abs(own) + np.abs(step) * clock
+    between = np.abs(step) * (a.clock + b.clock) if step.any() else 0.0
+    allowed = rounded + 8 * _EPS * np.abs(own) + between
     # A value that is missing contradicts none.
     return np.asarray(~(np.abs(value + part * step - own) > allowed).any(axis=1))

@@ -12,12 +12,13 @@ from rough_fields import Bump
 
 import gapcert as gc
 import gapcert_functions
+from gapcert.plugin import AffinePredictor
 from gapcert.testing import GapFamilyContract
 from gapcert_bounds.config import BasisConfig, ConstantConfig, EnvelopeConfig
 from gapcert_bounds.families import cone
 from gapcert_bounds.families.basis import Basis, own_slope, parse, shortfall
 from gapcert_bounds.families.constant import Constant
-from gapcert_bounds.families.envelope import Envelope
+from gapcert_bounds.families.envelope import Envelope, EnvelopeGap
 from gapcert_bounds.families.multilinear import Multilinear
 from gapcert_bounds.testing.fields import Kink, Waves, gap_problem, lattice
 
@@ -370,3 +371,21 @@ def test_options():
         BasisConfig(kind="basis", functions=[])
     with pytest.raises(ValueError, match="predictor"):
         BasisConfig(kind="basis", functions=["1"], predictor="multilinear")
+
+
+@pytest.mark.parametrize("nz", [1, 2, 3, 9, 17])
+@pytest.mark.parametrize("kind", ["affine", "none"])
+def test_an_envelope_of_one_point_has_the_bits_of_many(nz: int, kind: str) -> None:
+    rng = np.random.default_rng(nz)
+    nx, count = 3, 1 + 40 * nz
+    z, g, L = rng.uniform(-1, 1, (count, nz)), rng.normal(size=(count, nx)), rng.exponential(size=(nx, nz))
+    L[rng.random((nx, nz)) < 0.2] = 0.0
+    none = AffinePredictor.none(nx, nz)
+    p = none if kind == "none" else AffinePredictor(rng.normal(size=nx), rng.normal(size=(nx, nz)))
+    gap = EnvelopeGap(z, g, L, np.abs(1e-9 * rng.normal(size=nx)), p)
+    points = np.vstack([rng.uniform(-1, 1, (60, nz)), z[:10], np.zeros((1, nz))])
+    low, high = gap.interval(points)
+    for k in range(len(points)):
+        one = gap.interval(points[k : k + 1])
+        assert np.array_equal(one[0][0], low[k])
+        assert np.array_equal(one[1][0], high[k])

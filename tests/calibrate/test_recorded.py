@@ -194,3 +194,36 @@ def test_a_real_double_pendulum() -> None:
     assert gc.check(c.certified, log).band_violations <= 0.001 * len(c.held.z)
     with pytest.raises(gc.UsageError, match=r"1 trajectories .* needs 99 others"):
         gc.calibrate_recording(model, log, domain, violation=0.01)
+
+
+def test_what_was_measured_once_is_one_unit() -> None:
+    """Seven times the same log is one log: cut, renamed, shifted, and with fewer digits as well."""
+    log = recording(45)
+    rounded = tuple(
+        gc.Trajectory(tr.t + 9, {n: np.round(v, 7) for n, v in tr.channels.items()}, f"later {k}")
+        for k, tr in enumerate(log.trajectories)
+    )
+    cut = tuple(tr.part(0, 18) for tr in log.trajectories)
+    model = Drift(1)
+    domain, options = gc.Domain.of(model, RANGES), {"violation": 0.05}
+    once = gc.calibrate_recording(model, log, domain, **options)
+    many = gc.calibrate_recording(model, gc.Recording(cut + log.trajectories + rounded + cut), domain, **options)
+    assert (many.units, many.rank) == (once.units, once.rank) == (45, 30)
+    assert "'0 (1)' is a copy of '0 (46)'" in many.assumptions[-1]
+    assert "and 125 more" in many.assumptions[-1]
+    assert sum("counted once" in w for w in many.warnings) == 11
+    few = gc.Recording(recording(9).trajectories * 5)
+    with pytest.raises(gc.UsageError, match=r"9 trajectories have .* counts once: '0 \(10\)' is a copy of '0 \(1\)'"):
+        gc.calibrate_recording(model, few, domain, **options)
+
+
+def test_no_window_of_the_fit_is_among_the_held_ones() -> None:
+    """One log twice in a file, going on in time: halves of it lie at other places of their windows, and are the same."""
+    (tr,) = recording(1, steps=600).trajectories
+    whole = gc.Trajectory(PERIOD * np.arange(1202), {n: np.tile(v, 2) for n, v in tr.channels.items()})
+    model = Drift(1)
+    c = gc.calibrate_recording(model, gc.Recording((whole,)), gc.Domain.of(model, RANGES), violation=0.1, window=1.3)
+    rows = {tuple(z) for z in c.fit.z}
+    assert rows.isdisjoint({tuple(z) for z in c.held.z})
+    assert c.units <= 601 / 13
+    assert "a copy of rows of" in c.assumptions[-1]

@@ -1,6 +1,7 @@
 """Every verdict can be reached, with its evidence, and the summary keeps its keys."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from exams.hide import hide
 import gapcert as gc
 from gapcert.testing import multisine
 from gapcert_diagnosis import Diagnoser, Diagnosis
+from gapcert_diagnosis.diagnose import _once as once
 from gapcert_diagnosis.testing import ROD, equations
 
 PERIOD = 0.01
@@ -234,3 +236,26 @@ def test_a_model_is_left_to_a_diagnoser_that_accepts_it(monkeypatch):
     assert (found.verdict, found.log, list(found.timings)) == ("nothing", {"fitted": 1}, ["asked"])
     monkeypatch.setattr(Somebodys, "accepts", lambda self, model: False)
     assert "search" in find(model, recording, FRICTIONS, horizons=[0.5]).timings
+
+
+def test_what_is_held_out_is_not_fitted_under_another_name():
+    model, recording = swung([DRY], seconds=8.0)
+    (tr,) = recording.trajectories
+    other = replace(swung([DRY], seed=2, seconds=8.0)[1].trajectories[0], name="other")
+    named = {n: replace(tr, name=n) for n in ("one", "two")}
+    again = replace(named["one"], t=tr.t + 30, channels={n: np.round(v, 6) for n, v in tr.channels.items()}, name="again")
+    log = replace(recording, trajectories=(again, other, named["one"]))
+    said = []
+    found = find(model, log, FRICTIONS, hold_out={"trajectories": ["one"]}, horizons=[0.5], emit=said.append)
+    told = "what is in the recording twice counts once: 'again' is a copy of 'one'"
+    assert told in found.assumptions
+    assert any(e.data.get("message") == told for e in said)
+    alone = find(
+        model, replace(log, trajectories=(other, named["one"])), FRICTIONS, hold_out={"trajectories": ["one"]}, horizons=[0.5]
+    )
+    assert found.summary()["causes"] == alone.summary()["causes"]
+    with pytest.raises(gc.UsageError, match="what is left for the fit is a copy of what is held out"):
+        find(model, replace(log, trajectories=(again, named["one"])), FRICTIONS, hold_out={"trajectories": ["one"]})
+    # Where each trajectory ends in what is held out, one that is a copy ends nowhere.
+    parts = once(replace(log, trajectories=(named["one"], again, other)), {"last": 0.25}, None, ["torque"])[0]
+    assert [[t.name for t in part.trajectories] for part in parts] == [["one", "other"], ["one", "other"]]

@@ -10,7 +10,7 @@ import pytest
 import gapcert as gc
 from gapcert.cli.main import main
 from gapcert.testing.toys import Drift, Perturbed, ripple, ripple_lipschitz
-from gapcert_monitor.check import check, rate_limit
+from gapcert_monitor.check import check, rate_limit, tolerated
 from gapcert_recordings.transitions import Transitions
 
 RANGES = {"x0": (-1.0, 1.0), "u0": (-2.0, 2.0)}
@@ -183,6 +183,84 @@ def test_a_monitor_counts_what_a_check_counts(certificate):
     assert sum(s.violated for s in seen) == found.violated
     assert all(np.isinf(s.gamma).all() for s in seen if not s.inside)
     assert monitor.step(np.zeros(1), np.zeros(1), np.array([np.nan])).violated
+
+
+def test_a_claim_stands_until_it_is_refuted_at_its_own_level(certificate):
+    """k violations of n transitions refute ε where so many have probability β or less; any refutes a claim about all of Z."""
+    from scipy.stats import binom
+
+    t, x, u = motion(1000)
+    plain = gc.Certified.of(certificate)
+    n = check(plain, recording(t, x, u)).points
+    statistical = gc.Claim("statistical", 0.004, 1e-5, "X × U")
+    most = tolerated(statistical, n)
+    assert binom.sf(most, n, 0.004) <= 1e-5 < binom.sf(most - 1, n, 0.004)
+    # Pushes that are apart, so that each is a violation of its own.
+    for pushes, verdict in ((most - 2, "holds"), (most + 4, "violated")):
+        times = range(20, 20 + 15 * pushes, 15)
+        log = recording(*motion(1000, extra=lambda k, x, u, times=times: 0.2 if k in times else 0.0))
+        found = check(replace(plain, claim=statistical), log)
+        assert (found.units, found.allowed) == (found.points, tolerated(statistical, found.points))
+        assert (found.verdict, found.violated > found.allowed) == (verdict, verdict == "violated")
+        assert len(found.violations) == found.violated > 0
+        for claim in (None, gc.Claim("deterministic"), gc.Claim("empirical"), gc.Claim("assumed")):
+            assert check(replace(plain, claim=claim), log).verdict == "violated"
+    assert (
+        "no more often than the claim allows"
+        in check(
+            replace(plain, claim=statistical), recording(*motion(1000, extra=lambda k, x, u: 0.2 if k == 300 else 0.0))
+        ).hint
+    )
+
+
+def test_an_unchanged_plant_leaves_a_statistical_claim_alone(certificate):
+    """Where r leaves the band with probability ε, as the claim allows, no log of some hundred is accused at β."""
+    rng, plain = np.random.default_rng(2), gc.Certified.of(certificate)
+    claimed = replace(plain, claim=gc.Claim("statistical", 0.01, 1e-4, "X × U"))
+    verdicts = []
+    for seed in range(30):
+        rare = set(np.flatnonzero(rng.random(300) < 0.008).tolist())
+        log = recording(*motion(300, extra=lambda k, x, u, rare=rare: 0.2 if k in rare else 0.0, seed=seed))
+        verdicts.append((check(claimed, log).verdict, check(plain, log).verdict))
+    assert all(v == "holds" for v, _ in verdicts)
+    assert sum(v == "violated" for _, v in verdicts) > 20
+
+
+def test_of_windows_each_counts_once(certificate):
+    distribution = gc.plugin.order_statistics.DRAWN_WINDOWS
+    log = recording(*motion(400, extra=lambda k, x, u: 0.2 if k in (100, 101, 104) else 0.0))
+    claim = gc.Claim("statistical", 0.1, 0.01, distribution)
+    found = check(replace(gc.Certified.of(certificate), claim=claim, window=4.0), log)
+    assert (found.units, found.violated > 1, found.verdict) == (10, True, "holds")
+    found = check(replace(gc.Certified.of(certificate), claim=claim), log)
+    assert (found.units, found.allowed, found.verdict) == (1, 1, "holds")  # a whole log is one unit
+
+
+def test_a_log_that_is_given_twice_counts_once(certificate):
+    t, x, u = motion()
+    (tr,) = recording(t, x, u).trajectories
+    again = gc.Trajectory(t + 50, {"x0": np.round(x, 6), "u0": np.round(u, 6)}, "later")
+    found = certificate.check(gc.Recording((tr, again)))
+    assert found.points == certificate.check(recording(t, x, u)).points
+    assert found.copies == ("'later' is a copy of '0'",)
+
+
+def test_one_step_of_the_monitor_is_the_certificate_at_that_point(certificate):
+    """To the last bit, inside and outside of Z, and wherever turns or relations decide."""
+    base, rng = gc.Certified.of(certificate), np.random.default_rng(4)
+    tilted = replace(base, zone=gc.Domain.of(base.model, RANGES, ["x0 + u0 <= 1.5"]).zone)
+    for certified in (base, tilted):
+        monitor = gc.Monitor(certified)
+        for x, u in zip(rng.uniform(-1.2, 1.2, (200, 1)), rng.uniform(-2.2, 2.2, (200, 1)), strict=True):
+            after = x + PERIOD * u + 0.01 * rng.normal(size=1)
+            seen, z = monitor.step(x, u, after), certified.points(x[None], u[None])
+            assert seen.inside == certified.zone.contains(z)[0]
+            r = certified.residual(x[None], u[None], after[None])[0]
+            assert np.array_equal(seen.residual, r)
+            if seen.inside:
+                low, high = (end[0] for end in certified.band(np.repeat(z, 3, axis=0)))
+                assert np.array_equal(seen.gamma, np.maximum(abs(low), abs(high)))
+                assert seen.violated == bool((abs(r) > seen.gamma).any())
 
 
 def test_the_rate_limit_is_that_of_the_binomial():
