@@ -6,16 +6,8 @@
 
 Questions are all specs in specs/ and a quick exam (benchmarks/exams), in which an effect is hidden in each recording. Each is
 asked in a process of its own, with one thread. Words, counts and digests must be equal and numbers within a relative tolerance;
-<<<<<<< HEAD
-how long something took, and where, is left out. An audit's points hang on every bit of what is audited, so
-on the processor: where another function was audited, words are compared and numbers are not.
-||||||| fadb03e8
-how long something took, and where, is left out. An audit's points hang on every bit of what is audited, and so on the processor:
-where another function was audited, words are compared and numbers are not.
-=======
 how long something took, and where, is left out. An audit's points hang on every bit of what is audited, so on the processor:
 where another function was audited, words are compared and numbers are not.
->>>>>>> book/book
 """
 
 from __future__ import annotations
