@@ -282,10 +282,8 @@ class Around(Law):
         return np.asarray(self.pool[(uniforms(key, 1)[:, 0] * len(self.pool)).astype(np.intp)])
 
     def describe(self) -> str:
-        return (
-            f"in equal parts at its default, as rollouts of up to {THRESHOLDS.harmless_steps} steps leave it, and moved from "
-            f"its default as the probe does"
-        )
+        long = f"as rollouts of up to {THRESHOLDS.harmless_steps} steps leave it"
+        return f"in equal parts at its default, {long}, and moved from its default as the probe does"
 
     def digest(self) -> str:
         return json_digest("around", hashlib.sha256(self.pool.tobytes()).hexdigest())

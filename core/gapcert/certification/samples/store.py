@@ -23,6 +23,7 @@ import numpy.typing as npt
 from gapcert.certification.gates.again import in_calls
 from gapcert.certification.samples.executors import abandon, cores, done_with, processes
 from gapcert.certification.samples.extremes import Extremes
+from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.gaps.lipschitz import Residual
 from gapcert.contracts.gaps.predictor import Samples
 from gapcert.contracts.plugins.events import Emit, Event, silent
@@ -235,7 +236,8 @@ class Store:
         payload = pickle.dumps(self.residual)
 
         def task(i: int, start: int, stop: int) -> Task:
-            return Task(i, payload, points, start, stop, start, extremes, _shard(folder, i), self.in_calls)
+            calls = self.in_calls and start < 2 * THRESHOLDS.small_calls_rows  # of which half are asked in small calls
+            return Task(i, payload, points, start, stop, start, extremes, _shard(folder, i), calls)
 
         # One chunk is not worth a pool, and a system of the running script cannot be sent to one; the bits are the same.
         if len(todo) <= 1 or b"__main__" in payload:
