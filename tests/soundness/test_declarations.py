@@ -210,3 +210,31 @@ def test_a_run_refuses_what_is_false_and_names_what_is_open(tmp_path: Any) -> No
     said = gc.run(spec("0.3*(p - p**3) - 0.3*p*(1 - p**2)", **more), out=tmp_path).summary["certificate"]["assumptions"]
     assert any("nothing proves it" in s for s in said)
     assert any("both systems, but for those along p, which rest on the declared symmetry." in s for s in said)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_points_of_the_audit_are_held_against_declared_constants_and_symmetries(seed: int) -> None:
+    """Of an engine: a bump that no sample of the bound meets, and some of the audit do; it stays below any γ."""
+    problem, rng = asked("0*x0", 2), np.random.default_rng(seed)
+    at, width = rng.uniform(-1.5, 2.5, 2), 10 ** rng.uniform(-1, -0.7)
+
+    def bump(z: Array) -> Array:
+        return np.stack([0.4 * np.maximum(0, 1 - np.abs(z[:, :2] - at).max(axis=1) / width), 0 * z[:, 0]], axis=1)
+
+    z, fresh = (problem.domain.draw(n, rng) for n in (60, 8000))
+    z = z[bump(z)[:, 0] == 0]
+    assert bump(fresh).any()
+    flat, true = np.full((2, 3), 0.05), np.array([[0.4 / width] * 3, [0.0] * 3])
+    symmetry = Symmetry(("x0", "x1"), (0, 1), 0, (0.0, 0.0))
+    for value, provenance, held_, found in (
+        (flat, "declared", None, True),
+        (true, "declared", None, False),
+        (flat, "interval", None, False),
+        (np.zeros((2, 3)), "interval", symmetry, True),
+    ):
+        bound = LipschitzBound(value, 0 * value, provenance, "")
+        whole = GapProblem(Samples(z, bump(z)), problem.domain, bound, problem.predictor, problem.resolution, "dominate")
+        told = contradiction.by_audit(replace(whole, symmetry=held_), fresh, bump(fresh))
+        assert (told is not None) == found
+        assert told is None or (told["state"] == 0 and told["change"] > told["allowed"])
+        assert contradiction.by_audit(replace(whole, symmetry=held_), z, bump(z)) is None
