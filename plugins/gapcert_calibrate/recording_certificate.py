@@ -121,8 +121,8 @@ class CalibratedRecording(Shown):
     """A band that holds for all transitions of a further window, with probability 1 − ε on average over calibrations.
 
     `units` windows met Z; those of `fit` gave the band, those of `held` its widening: score · scale, (nx,), with the score of
-    `rank` among their `scores`. `states` are figures over the transitions of the held windows. number: which calibration on
-    these measurements it is, where a ledger counts them.
+    `rank` among their `scores`. `states` are figures over the transitions of the held windows. window: the length of one in s,
+    None for whole trajectories. number: which calibration on these measurements it is, where a ledger counts them.
     """
 
     gap: CalibratedGap
@@ -138,6 +138,7 @@ class CalibratedRecording(Shown):
     score: float
     scores: Array
     states: Mapping[str, StateEvidence]
+    window: float | None = None
     number: int | None = None
     versions: Mapping[str, str] = field(default_factory=dict)
 
@@ -198,6 +199,7 @@ class CalibratedRecording(Shown):
     def summary(self) -> dict[str, Any]:
         measured = {
             "units": self.units,
+            "window": self.window,
             "windows": {"fit": len(self.fit), "calibration": len(self.held)},
             "transitions": {"fit": len(self.fit.z), "calibration": len(self.held.z)},
             "rows": self.held.unused,
@@ -229,12 +231,12 @@ class CalibratedRecording(Shown):
         arrays |= {"calibration.scale": self.scale}
         if p.predictor.kind == "model":
             arrays |= {"predictor.samples": p.predictor(p.samples.z), "predictor.calibration": p.predictor(self.held.z)}
-        content, domain = npz_bytes(arrays), p.domain
+        content = npz_bytes(arrays)
         data = {
             **self.summary(),
             "form": dict(self.gap.form),
             "predictor": p.predictor.kind,
-            "domain": domain_data(domain),
+            "domain": domain_data(p.domain, self.model),
             "cover": None,
             "seed": p.seed,
             "digests": {},
@@ -295,7 +297,7 @@ def calibrate_recording(
     states = figures(band, problem, model, held.z, held.r, constant(band, problem, held.z, rank, scored))
     versions = {"gapcert": __version__, "numpy": np.__version__, "python": platform.python_version()}
     return CalibratedRecording(
-        band, problem, model, claim, said, units, own, held, scale, rank, score, each, states, versions=versions
+        band, problem, model, claim, said, units, own, held, scale, rank, score, each, states, window, versions=versions
     )
 
 

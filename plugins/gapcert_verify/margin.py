@@ -51,6 +51,12 @@ def margin(e: Evidence) -> str | None:
     return ""
 
 
+def radii(e: Evidence) -> tuple[float, float]:
+    """(εx, εu) of the stated grid, rounded up."""
+    h, nx = _half_widths(e.data), e.data["domain"]["states"]
+    return float(_norm(h[:nx]).hi), float(_norm(h[nx:]).hi)
+
+
 def _clearance(e: Evidence, i: int, z: Array, r: Array) -> float:
     """min_k γ_i(z_k) − |r_ki|, from below."""
     worst = math.inf

@@ -18,6 +18,7 @@ import numpy as np
 
 from gapcert.plugin import DAMAGE, Array, Interval, UsageError, on_curvature
 
+from . import sentences
 from . import statements as stated
 from .calibration import calibrated, further, names, noise, windows
 from .evidence import Evidence, Part, another, bounds, distance, load, predictor
@@ -70,7 +71,12 @@ def verify_run(folder: Path | str) -> dict[str, Any]:
             ("figures of the states follow from the held windows", stated.held_figures),
             ("the claim is one that its evidence allows", further),
         ]
-    checks.append(("the controller is of this certificate", _controller))
+    checks += [
+        ("constants come from what they are said to come from", _method),
+        ("assumptions are those that the data give", sentences.assumptions),
+        ("warnings are those that gates and estimators give", sentences.warnings),
+        ("the controller is of this certificate", _controller),
+    ]
     results = []
     for name, check in checks:
         outcome = _attempt(check, evidence)
@@ -84,6 +90,10 @@ def verify_run(folder: Path | str) -> dict[str, Any]:
             f"{folder}: certificate.json is damaged ({type(error).__name__}: {error}); run the spec again"
         ) from None
     return {"verdict": verdict, "claim": claim, "checks": results, "trusted": trusted}
+
+
+def _method(e: Evidence) -> str | None:
+    return None if _bare(e) else sentences.method(e)
 
 
 def _controller(e: Evidence) -> str | None:

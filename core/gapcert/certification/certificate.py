@@ -244,14 +244,14 @@ class Statement(Shown, ABC):
         """γ watched online, one transition at a time: a `Monitor`."""
         return gapcert.Monitor(gapcert.Certified.of(self))
 
-    def _write(self, folder: Path, domain: Domain, predictor: str, arrays: Mapping[str, Array], **more: Any) -> None:
-        """`certificate.json`, the summary and `more`, and `certificate.npz`, γ's own arrays and others."""
+    def _write(self, folder: Path, z: dict[str, Any], predictor: str, arrays: Mapping[str, Array], **more: Any) -> None:
+        """`certificate.json`, the summary, Z and `more`, and `certificate.npz`, γ's own arrays and others."""
         content = npz_bytes({**{f"gap.{k}": v for k, v in self.gap.arrays().items()}, **arrays})
         data = {
             **self.summary(),
             "form": dict(self.gap.form),
             "predictor": predictor,
-            "domain": domain_data(domain),
+            "domain": z,
             "arrays": hashlib.sha256(content).hexdigest(),
             "versions": dict(self.versions),
             **more,
@@ -362,7 +362,7 @@ class Certificate(Statement):
             arrays["predictor.samples"] = p.predictor(p.samples.z)
         self._write(
             folder,
-            p.domain,
+            domain_data(p.domain, self.model),
             p.predictor.kind,
             arrays,
             symmetry=None if p.symmetry is None else p.symmetry.to_data(),
@@ -372,11 +372,15 @@ class Certificate(Statement):
         )
 
 
-def domain_data(domain: Domain) -> dict[str, Any]:
-    """Z as it is stored: names, how many are states, ends and relations."""
+def domain_data(domain: Domain, model: Model | None) -> dict[str, Any]:
+    """Z as it is stored: names, units, how many are states, ends and relations; the model's period and relative inputs."""
+    relative = getattr(model, "relative", None)
     return {
         "axes": [a.name for a in domain.axes],
+        "units": [a.unit for a in domain.axes],
         "states": domain.nx,
+        "period": None if model is None else model.period,
+        "coordinates": {} if relative is None else dict(zip((a.name for a in relative.axes), relative.texts, strict=True)),
         "low": domain.low.tolist(),
         "high": domain.high.tolist(),
         "relations": [{"text": r.text, "a": list(r.coefficients), "b": r.bound} for r in domain.relations],

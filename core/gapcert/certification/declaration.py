@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, final
 
-from gapcert.certification.certificate import Statement
+from gapcert.certification.certificate import Statement, domain_data
 from gapcert.certification.routes import declaration, scope
 from gapcert.contracts.gaps.claim import Claim
 from gapcert.contracts.gaps.gap import GapFunction
@@ -49,4 +49,4 @@ class Declaration(Statement):
 
     def save(self, folder: Path | str) -> None:
         """`certificate.json` and `certificate.npz`."""
-        self._write(Path(folder), self.domain, "none", {})
+        self._write(Path(folder), domain_data(self.domain, self.model), "none", {})
