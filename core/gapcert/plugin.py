@@ -9,7 +9,7 @@ from gapcert.lazy import LazyPackage, homes
 _HOME = homes(
     {
         "gapcert.certification.certificate": (
-            "Audit Certificate Ledger Record StateEvidence domain_data figures gap_digest saved_digest"
+            "Audit Certificate Ledger Record StateEvidence domain_data figures gap_digest overpowered saved_digest"
         ),
         "gapcert.certification.certify": "digest predictor_of",
         "gapcert.certification.compatibility": "unmatched unpaired",
@@ -17,7 +17,8 @@ _HOME = homes(
         "gapcert.certification.declaration": "Declaration",
         "gapcert.certification.gates.augment": "forgets widen",
         "gapcert.certification.gates.hidden_distribution": "Law beginning",
-        "gapcert.certification.gates.hidden_state": "Gate",
+        "gapcert.certification.gates.entry": "responses",
+        "gapcert.certification.gates.hidden_state": "Gate open_gate",
         "gapcert.certification.refutation": "Trails follow",
         "gapcert.certification.routes": "Findings Request Route",
         "gapcert.certification.samples.executors": "processes",
@@ -31,7 +32,7 @@ _HOME = homes(
         "gapcert.contracts.data.units": "magnitude pretty shown stated_units without_units",
         "gapcert.contracts.gaps.claim": "Claim beta_of",
         "gapcert.contracts.gaps.gap": "FitRoute GapFamily GapFunction GapProblem",
-        "gapcert.contracts.gaps.lipschitz": "LipschitzBound LipschitzEstimator LipschitzProblem Provenance Residual",
+        "gapcert.contracts.gaps.lipschitz": ("LipschitzBound LipschitzEstimator LipschitzProblem Provenance Residual Symmetry"),
         "gapcert.contracts.gaps.predictor": "AffinePredictor ModelPredictor Predictor Samples",
         "gapcert.contracts.plugins.events": "BEAT Emit Event Pulse Stages silent",
         "gapcert.contracts.plugins.options": "ConfigContract Keyed of_config",
@@ -67,8 +68,9 @@ _HOME = homes(
         "gapcert.run.progress_rate": "figure",
         "gapcert.run.run": "Outcome Study cpu_seconds",
         "gapcert.run.status": "RunFolder",
-        "gapcert.run.verdict": "outside share",
+        "gapcert.run.verdict": "beside_nominal nothing_won outside share",
         "gapcert.spec.compose": "regular",
+        "gapcert.spec.expect": "evaluate_expectations",
         "gapcert.spec.models": "near unknown_key validate",
         "gapcert.spec.relations": "backend_axes",
         "gapcert.spec.sections": "sections",

@@ -301,8 +301,8 @@ def _audited(e: Evidence) -> Iterator[Said]:
     a = e.data["audit"]
     if "calibration" in e.data:
         yield (
-            "It is about that distribution alone: it does not carry over to others, nor to a closed loop, which may stay in the "
-            f"part that was missed. The audit's {a['points']} points, drawn afterwards in the same way, are a second look: "
+            "It is about that distribution alone: it does not carry over to others, nor to a closed loop, which may stay in "
+            f"the part that was missed. The audit's {a['points']} points, drawn afterwards in the same way, are a second look: "
             f"{a['violations']} lie outside, and {a['allowed'] + 1} or more would refute the claim."
         )
         return
@@ -350,14 +350,14 @@ def _windows(e: Evidence) -> Iterator[Said]:
         f"about, are {like}. That is assumed, not tested; a machine that wears, warms up or decays breaks it."
     )
     yield (
-        f"{made['windows']['calibration']} units that the fit has not seen, chosen at random, set the band by the score of rank "
-        f"{made['rank']}. A further unit has a transition outside with probability {claim['epsilon']:g} at most, {level}"
+        f"{made['windows']['calibration']} units that the fit has not seen, chosen at random, set the band by the score of "
+        f"rank {made['rank']}. A further unit has a transition outside with probability {claim['epsilon']:g} at most, {level}"
     )
     yield "Model, domain, windows and family were chosen before anyone looked at how the held units come out."
     yield (
-        f"The residual is what was measured, noise included, over one period of {e.data['domain']['period']:g} s with the input "
-        f"held, where a transition begins in Z: {_box(e)}. Of {rows['all']:,} rows {rows['no_transition']:,} begin no such "
-        f"transition and {rows['outside']:,} one outside Z or in no whole window; nothing is said of them."
+        f"The residual is what was measured, noise included, over one period of {e.data['domain']['period']:g} s with the "
+        f"input held, where a transition begins in Z: {_box(e)}. Of {rows['all']:,} rows {rows['no_transition']:,} begin no "
+        f"such transition and {rows['outside']:,} one outside Z or in no whole window; nothing is said of them."
     )
     yield "It does not carry over to other inputs, machines or days, nor to a closed loop that chooses its own points."
 
@@ -391,8 +391,8 @@ def _gates(e: Evidence) -> list[re.Pattern[str]]:
     state, u = ("|".join(map(re.escape, part)) or "(?!)" for part in (states(e), z["axes"][z["states"] :]))
     return [
         re.compile(
-            rf"(?:{state}) of f̂ does not answer to (?:{u}) at all, and that of f does; look for a motor or a lock that holds the "
-            r"joint, or a wrong joint name"
+            rf"(?:{state}) of f̂ does not answer to (?:{u}) at all, and that of f does; look for a motor or a lock that holds "
+            r"the joint, or a wrong joint name"
         ),
         re.compile(
             rf"(?:{u}) moves (?:{state}) of f̂ {NUMBER} times as far as that of f; look for another time step, inertia or gain, "
@@ -430,8 +430,8 @@ def _recorded(e: Evidence) -> Iterator[Said]:
     rows = made["rows"]
     if 2 * rows["no_transition"] > rows["all"]:
         yield (
-            f"{rows['no_transition']:,} of {rows['all']:,} rows begin no transition of one period of {period:g} s (the next row "
-            f"is late, early or missing, a value is missing, or the input moved); the claim is about the others"
+            f"{rows['no_transition']:,} of {rows['all']:,} rows begin no transition of one period of {period:g} s (the next "
+            f"row is late, early or missing, a value is missing, or the input moved); the claim is about the others"
         )
     if made.get("number", 1) > 1:
         yield (

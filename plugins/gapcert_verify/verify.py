@@ -11,6 +11,7 @@ import hashlib
 import json
 import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,9 @@ from . import statements as stated
 from .calibration import calibrated, further, names, noise, windows
 from .evidence import Evidence, Part, another, bounds, distance, load, predictor
 from .margin import margin
+from .origin import CHECKS as ORIGIN
+from .origin import Check, Origin, origin
+from .presented import FOLDER, root, whole_run
 from .proofs import bent, dominates, exceeds, follows
 
 ROUTES = {
@@ -39,10 +43,11 @@ PROVENANCES = ("analytic", "interval", "declared", "estimated")
 UNIFORM = "uniform on X × U"
 
 
-def verify_run(folder: Path | str) -> dict[str, Any]:
+def verify_run(folder: Path | str, allow_code: bool = False, again: int = 0) -> dict[str, Any]:
     """{"verdict": "holds" | "fails", "claim", "checks": [{"check", "passed", "detail"}], "trusted": [sentence]}.
 
-    UsageError where there is no certificate.
+    allow_code: models that are code are run. again: so many stored transitions are stepped once more, by whatever backend the
+    spec names. UsageError where there is no certificate.
     """
     evidence = load(Path(folder))
     checks: list[tuple[str, Callable[[Evidence], str | None]]] = [
@@ -77,6 +82,13 @@ def verify_run(folder: Path | str) -> dict[str, Any]:
         ("warnings are those that gates and estimators give", sentences.warnings),
         ("the controller is of this certificate", _controller),
     ]
+    source = _whence(evidence, allow_code, bool(again))
+    checks += [
+        ("the folder of a run is whole", whole_run),
+        ("files match the root digest", root),
+        ("the spec is the one that was run", partial(_specified, source)),
+        *((name, partial(_asked, check, source)) for name, check in (*ORIGIN, *FOLDER)),
+    ]
     results = []
     for name, check in checks:
         outcome = _attempt(check, evidence)
@@ -84,7 +96,7 @@ def verify_run(folder: Path | str) -> dict[str, Any]:
             results.append({"check": name, "passed": outcome == "", "detail": outcome})
     verdict = "holds" if all(r["passed"] for r in results) else "fails"
     try:
-        claim, trusted = dict(evidence.data["claim"]), _trusted(evidence)
+        claim, trusted = dict(evidence.data["claim"]), _trusted(evidence, source)
     except DAMAGE as error:
         raise UsageError(
             f"{folder}: certificate.json is damaged ({type(error).__name__}: {error}); run the spec again"
@@ -124,50 +136,68 @@ def _stated(e: Evidence) -> str:
     return "" if (np.isfinite(gamma) & (gamma >= 0)).all() else f"γ is {gamma.tolist()}, which bounds nothing"
 
 
-def _trusted(e: Evidence) -> list[str]:
+def _trusted(e: Evidence, source: Origin | str | UsageError) -> list[str]:
     """What the verdict rests on beside the checks."""
+    told: list[tuple[str, Any]] = [
+        (f"Model, domain, names and what was asked are as stated: {source}.", not isinstance(source, Origin)),
+        ("Versions and times are as stated.", True),
+    ]
+    whole = isinstance(source, Origin) and source.whole
     if _bare(e):
-        return ["γ is what a person declares. No simulator was asked."]
+        return [text for text, so in ((_NOBODY, True), *told) if so]
     if "recording" in e.data:
         alike = "independent draws of one distribution" if "beta" in e.data["claim"] else "exchangeable"
-        return [
-            "The stored transitions are all of the recording's that begin in Z, and their residuals are those of f.",
-            f"The windows, and the one that the claim is about, are {alike}.",
-            "Model, domain, windows and family were chosen before anyone looked at the held windows.",
-            "Figures that need the model (overpowered, the constant bound, vacuous beside standing still) are as stated.",
+        told += [
+            ("The stored transitions are all of the recording's that begin in Z, and their residuals are those of f.", True),
+            (f"The windows, and the one that the claim is about, are {alike}, chosen before anyone looked at these.", True),
         ]
-    origin = e.data["lipschitz"]
-    compared = "they were compared with samples, not derived again."
-    constants = f"The constants are {origin['provenance']} ({origin['method']}); {compared}"
+        return [text for text, so in told if so]
+    origin, why = e.data["lipschitz"], source.why if isinstance(source, Origin) else str(source)
+    constants = f"The constants are {origin['provenance']} ({origin['method']}): with what is warned of slopes, as stated."
     if e.data["route"] == "calibrate":
         constants = "A calibrated band rests on no constants, but on points that no fit has seen: the run's order is trusted."
-    if e.data["route"] == "declared":
-        constants = "γ is what a person declares. Samples and audit had the chance to refute it."
-    sentences = [
-        "The stored residuals are those of f̂ and f: neither was run again.",
-        constants,
-        "Figures that need the model (overpowered, the constant bound, vacuous beside standing still) are as stated.",
+    proved = origin["provenance"] == "interval" and whole and e.data["predictor"] != "multilinear"
+    told += [
+        (f"What only f̂ can tell, residuals, hidden state, purity and attacks, is as stated: {why}.", not whole),
+        (constants, not proved and e.data["route"] != "declared"),
+        ("γ is what a person declares. Samples and audit had the chance to refute it.", e.data["route"] == "declared"),
+        (
+            "The constant lies above the envelope between the samples as stated: its model was not bounded again.",
+            e.data["predictor"] == "model" and e.data["form"]["form"] == "constant" and e.data["route"] == "dominate",
+        ),
+        (
+            "The predictor's values at samples and audited points are those of its model, which was not run again.",
+            e.data["predictor"] == "model" and not isinstance(source, Origin),
+        ),
+        (
+            f"Of {e.data['samples']['bound']} samples those that are not stored lie within the extremes of their coarse cells.",
+            e.reduced,
+        ),
+        ("The declared symmetry holds beyond the pairs that were looked at.", e.data.get("symmetry")),
+        ("The backend's draws for different seeds are independent.", noise(e)),
     ]
-    if on_curvature(e.data["form"]):
-        sentences.append("The curvature has the same origin; it was compared with second differences of neighbouring nodes.")
-    if e.data["predictor"] == "model" and e.data["form"]["form"] == "constant" and e.data["route"] == "dominate":
-        sentences.append("The constant lies above the envelope between the samples as stated: its model was not bounded again.")
-    if e.data["form"]["form"] in ("dominating", "network"):
-        sentences.append("What was proved of its functions was proved once more, on the stored data and by the same prover.")
-    if e.data["predictor"] == "model":
-        sentences.append(
-            "The predictor's values at samples and audited points are those of its model, which was not run again."
-        )
-    count = e.data["samples"]["bound"] if e.reduced else 0
-    told = {
-        "Hidden state was probed, drawn and attacked as stated: its values are not stored.": e.data.get("hidden"),
-        "The texts of the relations say what their coefficients do.": e.zone.relations,
-        "The declared symmetry holds beyond the pairs that were looked at.": e.data.get("symmetry"),
-        f"Of {count} samples those that are not stored lie within the extremes of their coarse cells.": e.reduced,
-        "The backend's draws for different seeds are independent.": noise(e),
-        "The attack's counts are as stated: its points are not stored.": e.data.get("attack"),
-    }
-    return [*sentences, *(text for text, so in told.items() if so)]
+    return [text for text, so in told if so]
+
+
+_NOBODY = "γ is what a person declares. No simulator was asked."
+
+
+def _whence(e: Evidence, allow_code: bool, engine: bool) -> Origin | str | UsageError:
+    try:
+        return origin(e.folder, allow_code, engine)
+    except UsageError as error:
+        return error
+    except DAMAGE as error:
+        return UsageError(f"spec.json cannot be built: {type(error).__name__}: {error}")
+
+
+def _specified(source: Origin | str | UsageError, e: Evidence) -> str | None:
+    return str(source) if isinstance(source, UsageError) else "" if isinstance(source, Origin) else None
+
+
+def _asked(check: Check, source: Any, e: Evidence) -> str | None:
+    """A check against the spec, where there is one."""
+    return check(e, source) if isinstance(source, Origin) else None
 
 
 def _attempt(check: Callable[[Evidence], str | None], evidence: Evidence) -> str | None:
@@ -176,6 +206,8 @@ def _attempt(check: Callable[[Evidence], str | None], evidence: Evidence) -> str
         return check(evidence)
     except DAMAGE as error:
         return f"the stored data are incomplete: {type(error).__name__}: {error}"
+    except UsageError as error:
+        return str(error)
 
 
 def _packed(e: Evidence) -> str:

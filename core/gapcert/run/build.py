@@ -163,21 +163,21 @@ class Build:
         question, axes = digest(model, backend, domain), [a.name for a in domain.axes]
         extended = self.predictor(family, backend, domain)
         model, backend, domain = self.relative(model, backend, domain)
-        return dict(
-            model=model,
-            backend=backend,
-            domain=domain,
-            question=question,
-            sampling=None if c.sampling is None and "seed" in backend.capabilities else self.sampling(domain, axes),
-            lipschitz=self.make("lipschitz.residual") if "residual" in c.lipschitz else None,
-            family=family,
-            predictor=extended,
-            route=asked.route if asked is not None else None,
-            request=request,
-            symmetries=c.symmetries.translation if c.symmetries is not None else (),
-            hidden=self.plan(backend),
-            seed=c.seed,
-        )
+        return {
+            "model": model,
+            "backend": backend,
+            "domain": domain,
+            "question": question,
+            "sampling": None if c.sampling is None and "seed" in backend.capabilities else self.sampling(domain, axes),
+            "lipschitz": self.make("lipschitz.residual") if "residual" in c.lipschitz else None,
+            "family": family,
+            "predictor": extended,
+            "route": asked.route if asked is not None else None,
+            "request": request,
+            "symmetries": c.symmetries.translation if c.symmetries is not None else (),
+            "hidden": self.plan(backend),
+            "seed": c.seed,
+        }
 
     def declare(self, model: Model, domain: Domain) -> Declaration:
         """γ as the spec states it, where it names no backend."""

@@ -1,0 +1,440 @@
+"""What a reader of a run folder sees, made again: its root digest, the summary, the controllers' figures, pictures and page."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import tempfile
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gapcert.plugin import (
+    Array,
+    Claim,
+    Controller,
+    Event,
+    __version__,
+    beside_nominal,
+    difference,
+    evaluate_expectations,
+    nothing_won,
+    order_statistics,
+    outside,
+    pretty,
+    registry,
+)
+from gapcert_cells import load_controller
+
+from .calibration import scores
+from .evidence import Evidence, bounds
+from .origin import Check, Origin, predictor
+from .sentences import states
+
+_CLOSE = 1e-9  # relative: a picture shows no less
+_LOOKS = 20_000_000  # at samples, by the pixels of one slice that are made again
+_OWN = {"form", "predictor", "domain", "arrays", "versions", "symmetry", "cover", "seed", "digests"}
+"""What a certificate stores beside its summary."""
+
+
+def read(e: Evidence, name: str) -> dict[str, Any] | None:
+    """A JSON object of the folder; None where there is no such file."""
+    path = e.folder / name
+    if not path.exists():
+        return None
+    found = json.loads(path.read_text(encoding="utf-8"))
+    if not isinstance(found, dict):
+        raise TypeError(f"{name} holds no object")
+    return found
+
+
+def root(e: Evidence) -> str | None:
+    """ "" where every file that the root names is what it was, and the root is theirs."""
+    stated = read(e, "root.json")
+    if stated is None:
+        return "root.json is missing from the folder of a run" if (e.folder / "summary.json").exists() else None
+    files = stated["files"]
+    for name, digest in files.items():
+        path = e.folder / name
+        if ".." in Path(name).parts or not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != digest:
+            return f"{name} was changed, or is missing"
+    if lost := [n for n in ("spec.json", "summary.json", "certificate.json", "certificate.npz") if n not in files]:
+        return f"the root does not name {lost[0]}"
+    own = hashlib.sha256(json.dumps(files, sort_keys=True).encode()).hexdigest()
+    return "" if stated["root"] == own else "the root is another one than that of its files"
+
+
+def summary(e: Evidence, o: Origin) -> str | None:
+    """ "" where the summary says of certificate, controller and verdict what follows."""
+    if (told := read(e, "summary.json")) is None:
+        return None
+    made = {k: v for k, v in e.data.items() if k not in _OWN}
+    if told["certificate"] != made:
+        other = next((k for k in {**made, **told["certificate"]} if made.get(k) != told["certificate"].get(k)), "")
+        return f"certificate.{other} of the summary is not that of the certificate"
+    name, run = o.build.spec.config.name, Path(told["run_dir"]).name
+    if told["name"] != name or run != f"{name}-{o.build.spec.digest[:8]}":
+        return f"the summary is of {told['name']} in {run}, and the spec is {name}"
+    known = {"name", "run_dir", "verdict", "reason", "certificate", "controller", "closed_loop", "beside", "timings"}
+    if more := sorted(set(told) - known - {"expectations"}):
+        return f"'{more[0]}' is no part of a summary that is known"
+    if text := _controlled(e, told) or _looped(e, told):
+        return text
+    failures = [*_refutations(e, o, told), *_lost(e), *_loop_failures(told, e.data["claim"]["kind"])]
+    verdict = ("fails", failures[0]) if failures else ("holds", reason(e))
+    if (told["verdict"], told["reason"]) != verdict:
+        return f"the answer is stated as '{told['verdict']}: {told['reason']}', and '{verdict[0]}: {verdict[1]}' follows"
+    expect = o.build.spec.config.expect
+    answers = json.loads(json.dumps(evaluate_expectations(expect, told), default=str)) if expect else None
+    return "" if told.get("expectations") == answers else "expectations are answered otherwise than the summary says"
+
+
+def reason(e: Evidence) -> str:
+    """Why the claim holds."""
+    c = e.data["claim"]
+    if "recording" in e.data:
+        level = f"ε = {c['epsilon']:g}" + (f", β = {c['beta']:g}" if "beta" in c else "")
+        seen = f"{e.data['recording']['windows']['calibration']} windows that the fit has not seen set it"
+        return f"the gap function holds at level statistical ({level}, {c['distribution']}): {seen}"
+    if "audit" not in e.data:
+        return "γ is declared and assumed; no simulator was asked"
+    a = e.data["audit"]
+    if c["kind"] == "assumed":
+        return f"γ is declared and assumed; {a['points']} audited points do not refute it"
+    level = c["kind"]
+    if level == "statistical":
+        level = f"statistical (ε = {c['epsilon']:g}, β = {c['beta']:g}, {c['distribution']})"
+    head = f"the gap function holds at level {level}: "
+    if made := e.data.get("calibration"):
+        return (
+            f"{head}{made['points']} calibration points; {a['violations']} of {a['points']} audited points lie outside, as it "
+            f"allows"
+        )
+    return f"{head}{a['points']} audited points without a violation"
+
+
+def _refutations(e: Evidence, o: Origin, told: Mapping[str, Any]) -> list[str]:
+    """What refutes the claim, or keeps it from being reached, as a run tells it."""
+    if "audit" not in e.data:
+        return []
+    a, units, out = e.data["audit"], dict(zip(e.data["domain"]["axes"], e.data["domain"]["units"], strict=True)), []
+    refuted = next((s for s in e.data["assumptions"] if s.startswith("REFUTED")), "")
+    if a["violations"] > a.get("allowed", 0):
+        w = a["witness"]
+        at = ", ".join(f"{n} = {v:.4g}{_unit(units[n])}" for n, v in zip(e.data["domain"]["axes"], w["z"], strict=True))
+        state = states(e)[w["state"]]
+        out.append(
+            f"the audit refutes the gap function: {a['violations']} of {a['points']} points; at {at} the residual of {state} "
+            f"is {w['residual']:.6g}{_unit(units[state])}, {outside(w)}"
+        )
+    if (h := e.data.get("hidden", {}).get("attack", {})) and (w := h.get("witness")):
+        out.append(
+            f"γ of the default hidden state does not hold for others: {h['violations']} of {h['points']} probes exceed it; at "
+            f"(x, u) = {w['z']} with hidden state {w['hidden']} the residual of {w['state']} is {w['residual']:.6g}, and γ is "
+            f"{w['gamma']:.6g}"
+        )
+    if (further := e.data.get("attack")) and further["violations"] > further.get("allowed", 0):
+        out.append(f"{further['violations']} of {further['points']} further fresh points leave [l, u]")
+    asked = o.build.spec.config.certificate
+    if asked is not None and asked.claim != e.data["claim"]["kind"] and not out:
+        out.append(f"a {asked.claim} claim was asked for: {refuted or 'its evidence does not allow it'}")
+    elif refuted and not out:
+        out.append(refuted)
+    return out
+
+
+def _unit(unit: str) -> str:
+    return "" if unit in ("", "1") else f" {unit}"
+
+
+def _controllers(e: Evidence) -> dict[str, Controller]:
+    where = e.folder / "controller"
+    names = [n for n in ("with_gamma", "without_gamma") if (where / n / "controller.json").is_file()]
+    return {n: load_controller(where / n) for n in names}
+
+
+def _lost(e: Evidence) -> list[str]:
+    controller = _controllers(e).get("with_gamma")
+    nothing = controller is not None and (not controller.wins or "reason" in controller.evidence)
+    return [nothing_won(controller.evidence)] if nothing and controller is not None else []
+
+
+def _controlled(e: Evidence, told: Mapping[str, Any]) -> str:
+    """The row of the controller, of what both saved ones say."""
+    made, stated = _controllers(e), told.get("controller")
+    if len(made) < 2:
+        return "a controller is told of, and none is stored" if stated else ""
+    careful, trusting = made["with_gamma"], made["without_gamma"]
+    kind = e.data["claim"]["kind"]
+    carried = Claim(kind) if kind in ("deterministic", "assumed") else Claim("empirical")
+    if careful.evidence.get("assumptions") and carried.kind != "assumed":
+        carried = Claim("empirical")
+    facts, other = careful.facts(), trusting.facts()
+    said = {"kind": careful.kind, "claim": carried.summary(), **facts, **beside_nominal(facts, other)}
+    said = json.loads(json.dumps(said, default=str))
+    if stated == said:
+        return ""
+    wrong = next((k for k in {**said, **(stated or {})} if said.get(k) != (stated or {}).get(k)), "")
+    return f"controller.{wrong} of the summary is not that of the saved controllers"
+
+
+def _looped(e: Evidence, told: Mapping[str, Any]) -> str:
+    """The closed loop's rows agree with each other, and with the runs that are stored."""
+    if (loop := told.get("closed_loop")) is None:
+        return ""
+    with np.load(e.folder / "closed_loop.npz", allow_pickle=False) as stored:
+        runs = {name: (stored[f"{name}_u"].shape[:2], int(stored[f"{name}_broken"].sum())) for name in _BOTH}
+    for name in _BOTH:
+        rows = [{k: v for k, v in r.items() if k != "controller"} for r in loop["policies"] if r["controller"] == name]
+        head = loop[name]
+        if head not in rows or (head["starts"], head["steps"]) != runs[name][0] or head["broken_promises"] != runs[name][1]:
+            return f"closed_loop.{name} is not what its policies and the stored runs say"
+        if any(not 0 <= r[k] <= r["starts"] for r in rows for k in ("violations", "stranded", "left_goal")):
+            return f"closed_loop.{name} counts more runs than there are"
+    if claim := loop.get("claim"):
+        ours = [r for r in loop["policies"] if r["controller"] == "with_gamma"]
+        least, most = max(r["violations"] for r in ours), sum(r["violations"] for r in ours)
+        if claim["runs"] != ours[0]["starts"] or not least <= claim["violations"] <= most or _small(claim):
+            return "the claim of the closed loop is not what its runs earn"
+    return ""
+
+
+_BOTH = ("with_gamma", "without_gamma")
+
+
+def _small(claim: Mapping[str, Any]) -> bool:
+    """Is ε smaller than the runs allow?"""
+    return bool(order_statistics.missed(claim["violations"], claim["runs"], claim["epsilon"]) > claim["beta"])
+
+
+def _loop_failures(told: Mapping[str, Any], claim: str) -> list[str]:
+    rows = [p for p in told.get("closed_loop", {}).get("policies", ()) if p["controller"] == "with_gamma"]
+    bad = [p for p in rows if p["violations"]]
+    out = [f"closed loop with γ: {p['violations']} of {p['starts']} runs fail under policy '{p['policy']}'" for p in bad]
+    broken = [p for p in rows if p.get("broken_promises") and claim in ("deterministic", "assumed")]
+    return out + [_broken(p) for p in broken]
+
+
+def _broken(row: Mapping[str, Any]) -> str:
+    text = f"closed loop with γ: {row['broken_promises']} steps under policy '{row['policy']}' break the controller's promise"
+    parts = {"gap": "γ, the residual being outside [l, u]", "bound": "the bound of the model's successors"}
+    found = [f"{n} refute {parts[cause]}" for cause, n in row.get("refuted", {}).items() if n]
+    return f"{text}: {' and '.join(found)}" if found else text
+
+
+# Pictures
+
+
+def figures(e: Evidence, o: Origin) -> str | None:
+    """ "" where the stored figures are those of the certificate, its controllers and the stored runs."""
+    if (drawn := read(e, "figures.json")) is None:
+        return None
+    with np.load(e.folder / "figures.npz", allow_pickle=False) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    if text := _lanes(drawn) or (_gap(e, o, drawn["gap"], arrays) if drawn["gap"] else ""):
+        return text
+    if drawn["recorded"] and (text := _recorded(e, drawn["recorded"], arrays)):
+        return text
+    if drawn["winning"] and (text := _winning(e, drawn["winning"], arrays)):
+        return text
+    return _loop(e, drawn["loop"], arrays) if drawn["loop"] else ""
+
+
+_STATE = re.compile(r"running|done|finished|holds|fails|unknown|claimed|\d+ violations")
+
+
+def _lanes(drawn: Mapping[str, Any]) -> str:
+    said = [s for lane in drawn["lanes"] for s in (*lane["states"], lane["stage"])]
+    strange = next((s for s in said if not (_STATE.fullmatch(s) or re.fullmatch(r"[\w-]{1,100}", s))), None)
+    return "" if strange is None else f"'{strange}' is no stage, nor how one ends"
+
+
+def _gap(e: Evidence, o: Origin, figure: Mapping[str, Any], arrays: Mapping[str, Array]) -> str:
+    z, nx = o.domain, o.domain.nx
+    axes = [
+        {"name": a.name, "unit": pretty(a.unit), "low": low, "high": high, "angle": a.kind == "angle"}
+        for a, low, high in zip(z.axes, z.low.tolist(), z.high.tolist(), strict=True)
+    ]
+    if len(figure["bands"]) != nx * len(axes):
+        return "there is no band for each state along each axis"
+    for k, band in enumerate(figure["bands"]):
+        j, i = divmod(k, nx)
+        points = np.tile(z.centre, (len(arrays[band["at"]]), 1))
+        points[:, j] = arrays[band["at"]]
+        own = {"state": axes[i]["name"], "unit": axes[i]["unit"], "axis": axes[j]}
+        if any(band[key] != v for key, v in own.items()) or band["constant"] != _constant(e, axes[i]["name"], band, arrays):
+            return f"the band of {axes[i]['name']} along {axes[j]['name']} is called, or bounded, otherwise"
+        ends = [float(v[0]) for v in z.chord(z.centre[None], j)]
+        if not _near(points[:, j], np.linspace(*ends, len(points)), np.subtract(*ends[::-1])):
+            return f"the band along {axes[j]['name']} is drawn at other points"
+        if text := _drawn_band(e, o, points, i, {key: arrays[band[key]] for key in ("low", "high", "gamma", "residual")}):
+            return text
+    order = _order(e, figure, arrays, nx)
+    if figure["axes"] != [axes[j] for j in order]:
+        return "the axes of the gap's pictures are others"
+    fixed = ((axes[j]["name"], z.centre[j], axes[j]["unit"]) for j in order[2:])
+    if figure["fixed"] != ", ".join(f"{n} = {m:.4g} {unit}".removesuffix(" 1") for n, m, unit in fixed):
+        return "the axes that are held are held elsewhere"
+    if not np.array_equal(arrays[figure["samples"]], e.samples[0][:, order]):
+        return "other samples are drawn than the bound's"
+    return _slices(e, o, figure, arrays, order) if figure["slices"] else ""
+
+
+def _constant(e: Evidence, name: str, band: Mapping[str, Any], arrays: Mapping[str, Array]) -> float:
+    return float(e.data["states"][name].get("constant_bound", np.max(arrays[band["gamma"]])))
+
+
+def _near(stored: Array, made: Array, size: float, e: float = 0.0) -> bool:
+    same = stored.shape == made.shape
+    return same and np.allclose(stored, made, rtol=_CLOSE, atol=_CLOSE * abs(size) + 4 * e, equal_nan=True)
+
+
+def _ends(e: Evidence, o: Origin, z: Array) -> tuple[Array, Array]:
+    own = replace(e, arrays={**e.arrays, "predictor.drawn": predictor(e, o)(z)}) if e.data["predictor"] == "model" else e
+    low, high = bounds(own, z, "predictor.drawn")
+    return low.mid, high.mid
+
+
+def _drawn_band(e: Evidence, o: Origin, z: Array, i: int, drawn: Mapping[str, Array]) -> str:
+    low, high = (end[:, i] for end in _ends(e, o, z))
+    size, rounded = float(np.abs([low, high]).max()), float(e.arrays["remainder.resolution"][i])
+    made = {"low": low, "high": high, "gamma": np.maximum(np.abs(low), np.abs(high))}
+    if name := next((k for k, v in made.items() if not _near(drawn[k], v, size, rounded)), ""):
+        return f"{name} of state {i} is drawn otherwise than it is"
+    if o.whole and (np.abs(_apart(o, z, drawn["residual"], i)) > 2 * e.arrays["resolution"][i]).any():
+        return f"the residual of state {i} is drawn otherwise than it is"
+    return ""
+
+
+def _apart(o: Origin, z: Array, drawn: Array, i: int) -> Array:
+    r = o.residual(z)
+    other = r.copy()
+    other[:, i] = drawn
+    return np.asarray(difference(o.model.states, r, other)[:, i])
+
+
+def _order(e: Evidence, figure: Mapping[str, Any], arrays: Mapping[str, Array], nx: int) -> list[int]:
+    """Axes along which hardly anything changes behind the others, those of a symmetry last."""
+    swing = np.array([np.ptp(arrays[b["residual"]]) for b in figure["bands"]]).reshape(-1, nx)
+    quiet = (swing < 0.1 * swing.max(axis=0)).all(axis=1)
+    inert = (e.data.get("symmetry") or {}).get("axes", ())
+    return sorted(range(len(swing)), key=lambda j: (j in inert, bool(quiet[j])))
+
+
+def _slices(e: Evidence, o: Origin, figure: Mapping[str, Any], arrays: Mapping[str, Array], order: Sequence[int]) -> str:
+    side = len(arrays[figure["slices"][0]["gamma"]])
+    centres = [z + w * (2 * np.arange(side) + 1) / (2 * side) for z, w in zip(o.domain.low, o.domain.width, strict=True)]
+    z = np.tile(o.domain.centre, (side * side, 1))
+    second, first = np.meshgrid(centres[order[1]], centres[order[0]], indexing="ij")
+    z[:, order[0]], z[:, order[1]] = first.ravel(), second.ravel()
+    step = max(1, len(z) * len(e.samples[0]) // _LOOKS)
+    inside = o.domain.contains(z)
+    rows = np.flatnonzero(inside)[::step]
+    low, high = _ends(e, o, z[rows])
+    for i, drawn in enumerate(figure["slices"]):
+        gamma, gap = (arrays[drawn[k]].ravel() for k in ("gamma", "gap"))
+        made = np.maximum(np.abs(low[:, i]), np.abs(high[:, i]))
+        size, rounded = float(made.max(initial=0.0)), float(e.arrays["remainder.resolution"][i])
+        if not _near(gamma[rows], made, size, rounded) or not np.isnan(gamma[~inside]).all():
+            return f"γ of state {i} is drawn otherwise than it is"
+        if o.whole and (np.abs(gap[inside] - np.abs(o.residual(z[inside])[:, i])) > 2 * e.arrays["resolution"][i]).any():
+            return f"|r| of state {i} is drawn otherwise than it is"
+    return ""
+
+
+def _recorded(e: Evidence, figure: Mapping[str, Any], arrays: Mapping[str, Array]) -> str:
+    held, r = e.arrays["held.window"], e.arrays["held.r"]
+    low, high = (np.sort(order_statistics.worst(own, held)) for own in scores(e, e.arrays["held.z"], [r]))
+    drawn, rank = arrays[figure["scores"]], e.data["recording"]["rank"]
+    room = _CLOSE * np.abs(high)
+    if figure["rank"] != rank or drawn.shape != low.shape or not ((low - room <= drawn) & (drawn <= high + room)).all():
+        return "the scores are drawn otherwise than they are"
+    for i, stretch in enumerate(figure["stretches"]):
+        rows = [np.flatnonzero(r[:, i] == v) for v in arrays[stretch["residual"]]]
+        if not all(len(found) for found in rows):
+            return f"a residual of {stretch['state']} is drawn that was not measured"
+        at = np.array([found[0] for found in rows])
+        ends = bounds(e, e.arrays["held.z"][at], "predictor.drawn") if e.data["predictor"] != "model" else None
+        size = float(np.abs(r[:, i]).max())
+        if ends is not None and all(len(found) == 1 for found in rows):
+            made = {"low": ends[0].mid[:, i], "high": ends[1].mid[:, i]}
+            rounded = float(e.arrays["remainder.resolution"][i])
+            if name := next((k for k, v in made.items() if not _near(arrays[stretch[k]], v, size, rounded)), ""):
+                return f"{name} of {stretch['state']} is drawn otherwise than it is"
+    return ""
+
+
+def _winning(e: Evidence, figure: Mapping[str, Any], arrays: Mapping[str, Array]) -> str:
+    """Drawn once more of the saved controllers, where asking them is cheap."""
+    both = _controllers(e)
+    if len(both) < 2 or any(c.resolution < 200 for c in both.values()):
+        return ""
+    with tempfile.TemporaryDirectory() as folder:
+        for part in registry().of("illustrator"):
+            tell = part.load()(Path(folder), lambda event: None)
+            tell(Event("stage-finished", "controller", both))
+            tell(Event("run-finished", "run", {"summary": {"name": "", "verdict": "holds"}}))
+        again = json.loads((Path(folder) / "figures.json").read_text(encoding="utf-8"))["winning"]
+        with np.load(Path(folder) / "figures.npz", allow_pickle=False) as stored:
+            names = [n for n in stored.files if n.startswith("/winning/")]
+            same = [n for n in arrays if n.startswith("/winning/")] == names and all(
+                np.array_equal(stored[n], arrays[n], equal_nan=True) for n in names
+            )
+    return "" if again == figure and same else "the winning domains are drawn otherwise than the saved controllers are"
+
+
+def _loop(e: Evidence, figure: Mapping[str, Any], arrays: Mapping[str, Array]) -> str:
+    """The runs that are drawn are the stored ones, and break as often as the summary says."""
+    told = (read(e, "summary.json") or {}).get("closed_loop", {})
+    angles = [axis["angle"] for axis in figure["axes"]]
+    with np.load(e.folder / "closed_loop.npz", allow_pickle=False) as stored:
+        for runs in figure["runs"]:
+            name = "with_gamma" if runs["gamma"] else "without_gamma"
+            head, broke, x = told.get(name, {}), arrays[runs["broke"]], stored[f"{name}_x"]
+            counts = (head.get("policy"), head.get("starts"), head.get("steps"), head.get("violations"))
+            if (runs["policy"], runs["starts"], runs["steps"], int((broke >= 0).sum())) != counts or len(broke) != len(x):
+                return f"the runs {name} are drawn otherwise than they are told"
+            for trace in arrays[runs["traces"]]:
+                apart = np.abs(x - trace)
+                apart[..., angles] = np.abs(np.remainder(apart[..., angles] + np.pi, 2 * np.pi) - np.pi)
+                gone = np.isnan(x) == np.isnan(trace)
+                if not ((np.nan_to_num(apart) <= 1e-9) & gone).all(axis=(1, 2)).any():
+                    return f"a run {name} is drawn that is not stored"
+    return ""
+
+
+def page(e: Evidence, o: Origin) -> str | None:
+    """ "" where `report.html` is what summary and figures give; None for one of another version."""
+    stored, told = e.folder / "report.html", read(e, "summary.json")
+    if not stored.is_file() or told is None or e.data["versions"]["gapcert"] != __version__:
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        where = Path(folder) / Path(told["run_dir"]).name
+        where.mkdir()
+        for item in e.folder.resolve().iterdir():
+            if item.name != stored.name:
+                with suppress(OSError):
+                    (where / item.name).symlink_to(item)
+        registry().get("report", "html").load()(where)
+        same = (where / stored.name).read_bytes() == stored.read_bytes()
+    return "" if same else "report.html is another page than summary and figures give"
+
+
+def whole_run(e: Evidence) -> str | None:
+    """ "" where the folder of a run holds its spec."""
+    if not (e.folder / "summary.json").exists():
+        return None
+    lost = [n for n in ("spec.json", "run.json", "figures.json") if not (e.folder / n).exists()]
+    return f"{lost[0]} is missing from the folder of a run" if lost else ""
+
+
+FOLDER: tuple[tuple[str, Check], ...] = (
+    ("the summary says what follows", summary),
+    ("pictures show what is stored", figures),
+    ("the page is that of summary and figures", page),
+)
