@@ -15,7 +15,7 @@ from gapcert import Array, Interval, Model, Recording, Trajectory, UsageError
 from gapcert.plugin import Coordinates, RelativeModel, Zone, damage_told, difference, magnitude, stated_units, without_units
 from gapcert_monitor.thresholds import THRESHOLDS
 from gapcert_recordings import Transitions, axes
-from gapcert_verify import Evidence, bounds, load, zone
+from gapcert_verify import Evidence, bounds, load, verify_run, zone
 
 if TYPE_CHECKING:
     from gapcert.plugin import Certificate, Declaration, Predictor
@@ -54,7 +54,7 @@ class Certified:
     def load(cls, folder: Path | str, allow_code: bool = False) -> Certified:
         """From a run's folder: its spec makes the model, its stored certificate the band; the backend is not needed.
 
-        Only where the certificate counts hidden states of the backend among its states is the backend built.
+        UsageError where `gapcert verify` refuses the folder. Only where the certificate counts hidden states of the backend among its states is the backend built.
         """
         with damage_told(folder):
             return cls._loaded(Path(folder), allow_code)
@@ -64,6 +64,8 @@ class Certified:
         from gapcert.plugin import Build, ModelPredictor, load_spec, regular, widen
 
         evidence, data = load(where), _stored(where, "spec.json")
+        if failed := next((c for c in verify_run(where, allow_code)["checks"] if not c["passed"]), None):
+            raise UsageError(f"{where}: is not what it claims ({failed['check']}: {failed['detail']}); run the spec again")
         home = Path(_stored(where, "run.json").get("folder", "."))
         # What is not asked for need not be there: neither engines nor their files.
         only = {k: data[k] for k in ("version", "name", "model")}

@@ -20,7 +20,7 @@ def verify(options: Arguments) -> Answer:
     from gapcert.plugin import columns
     from gapcert_verify import verify_run
 
-    answer = verify_run(Path(options.run))
+    answer = verify_run(Path(options.run), options.allow_code, options.again)
     rows = [("passed" if c["passed"] else "FAILED", c["check"], c["detail"]) for c in answer["checks"]]
     rows += [("trusted", sentence, "") for sentence in answer.get("trusted", ())]
     words = [f"{options.run}: {answer['verdict']}", *columns(("", "check", ""), rows)]

@@ -7,6 +7,9 @@ _NOISE = Argument(
     "by how much a channel may err, such as theta=1e-4",
     {"action": "append", "default": [], "metavar": "CHANNEL=VALUE"},
 )
+_AGAIN = Argument(
+    "--again", "step so many stored transitions of engine and model once more", {"type": int, "default": 0, "metavar": "N"}
+)
 
 
 @hookimpl
@@ -25,6 +28,6 @@ def gapcert_components() -> list[Component]:
             "verify",
             "check a certificate again from its stored data",
             "gapcert_monitor.commands:verify",
-            arguments=(RUN,),
+            arguments=(RUN, _AGAIN, ALLOW_CODE),
         ),
     ]

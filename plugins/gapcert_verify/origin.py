@@ -53,15 +53,19 @@ _SAME = 1e-9  # relative: figures that were added up in another order
 @final
 @dataclass(frozen=True)
 class Origin:
-    """What a run asked. asked: the arguments of `certify`, as far as they can be made here; `whole`: with the backend.
-
-    why: why the backend, or all of it, was not made.
+    """What a run asked. asked: the arguments of `certify`, as far as they can be made here; `whole`: with the backend, which
+    is text where `why` is empty; else it says why not.
     """
 
     build: Build
     asked: Mapping[str, Any]
     whole: bool
     why: str = ""
+
+    @property
+    def text(self) -> bool:
+        """Is every step an equation of the spec, so that all may be stepped again?"""
+        return self.whole and not self.why
 
     @property
     def model(self) -> Model:
@@ -125,15 +129,14 @@ def _built(build: Build, engine: bool) -> Origin | str:
     if code and not build.allow_code:
         return f"the {code[0]} is code, which runs with --allow-code alone"
     model: Model = build.make("model")
-    if c.backend is not None and (engine or c.hidden.mode == "augment" or _text(build)):
+    why = "" if c.backend is None or _text(build) else f"the backend is no text ({c.backend.kind})"
+    if c.backend is not None and (engine or not why or c.hidden.mode == "augment"):
         backend, domain = build.against(model)
         model, backend = widen(model, backend, domain)
-        return Origin(build, build.asked(*build.remembered(model, backend), domain), True)
+        return Origin(build, build.asked(*build.remembered(model, backend), domain), True, why)
     # As for a declared γ: the model stands in for the backend, where only names and ranges are asked.
-    alone = build.with_sections(hidden=type(c.hidden)(), backend=c.backend)
-    asked = alone.asked(model, model, Domain.of(model, dict(c.domain or {}), c.relations))
-    why = "" if c.backend is None else f"the backend is no text ({c.backend.kind})"
-    return Origin(build, asked, False, why)
+    alone = build.with_sections(hidden=type(c.hidden)())
+    return Origin(build, alone.asked(model, model, Domain.of(model, dict(c.domain or {}), c.relations)), False, why)
 
 
 def _text(build: Build) -> bool:
@@ -200,7 +203,7 @@ def constants(e: Evidence, o: Origin) -> str | None:
         return f"safety is stated as {stated['safety']}, and the spec asks for {getattr(made, 'safety', 1.0)}"
     if any(s["safety_factor"] != stated["safety"] for s in e.data["states"].values()):
         return "a state has another safety factor than the constants"
-    needed = made.provenance == "declared" or (made.provenance == "interval" and o.whole)
+    needed = made.provenance == "declared" or (made.provenance == "interval" and o.text)
     return _again(e, o, made) if needed and e.data["predictor"] != "multilinear" else ""
 
 
@@ -270,13 +273,18 @@ def predicted(e: Evidence, o: Origin) -> str | None:
 
 def stepped(e: Evidence, o: Origin) -> str | None:
     """Every stored residual is that of f̂ and f, to within 2 e, and e that of their arithmetic; both are stepped again."""
-    if not o.whole or "audit" not in e.data:
+    if not o.text or "audit" not in e.data:
         return None
     if not np.allclose(o.residual.resolution(o.domain), e.rounding, rtol=1e-6, atol=0.0):
         return f"e is stated as {e.rounding.tolist()}, and that of f and f̂ is {o.residual.resolution(o.domain).tolist()}"
     for name, z, r in _rounds(e):
         if text := _apart(o, z, r, 2 * e.rounding, name):
             return text
+    return _keyed(e, o)
+
+
+def _keyed(e: Evidence, o: Origin) -> str:
+    """The digests that rounds were sampled under, of model, backend and domain."""
     key = digest(o.model, o.gate.system, o.domain)
     strange = next((n for n in e.data["digests"] if e.header(n)["key"] != key), "")
     # Another version may have other digests of the same.
@@ -348,7 +356,7 @@ def strength(e: Evidence, o: Origin) -> str | None:
 
 def attacked(e: Evidence, o: Origin, most: int = 100_000) -> str | None:
     """The further points that (seed, 0xA77AC) draws, as far as the first `most`, stepped and judged again."""
-    if not o.whole or not (stated := e.data.get("attack")):
+    if not o.text or not (stated := e.data.get("attack")):
         return None
     rng, n = np.random.default_rng([o.asked["seed"], 0xA77AC]), stated["points"]
     z = o.domain.draw(min(n, most), rng)
@@ -373,6 +381,16 @@ def _violations(e: Evidence, o: Origin, z: Array, r: Array) -> tuple[Any, Any]:
     sure = [(r < low.lo - slack) | (r > high.hi + slack), np.abs(r) > gamma + slack]
     may = [(r < low.hi + slack) | (r > high.lo - slack), np.abs(r) > gamma - 2 * slack]
     return tuple(np.array([rows.any(axis=1).sum() for rows in both]) for both in (sure, may))
+
+
+def again(e: Evidence, o: Origin, n: int) -> tuple[str, str]:
+    """n stored transitions, evenly chosen, stepped by f̂ and f once more: how they agree, and "" where they do within 2 e."""
+    z, r = (np.concatenate(parts) for parts in zip(*((z, r) for _, z, r in _rounds(e)), strict=True))
+    pick = np.unique(np.linspace(0, len(z) - 1, min(n, len(z))).astype(int))
+    z, r = z[pick], r[pick]
+    same = np.array_equal(o.residual(z), r)
+    how = "are the same bit for bit" if same else "agree within e, not bit for bit"
+    return f"{len(z)} stored transitions, stepped again, {how}", _apart(o, z, r, 2 * e.rounding, "samples") or _keyed(e, o)
 
 
 CHECKS: tuple[tuple[str, Check], ...] = (

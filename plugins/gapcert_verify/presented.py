@@ -306,7 +306,7 @@ def _drawn_band(e: Evidence, o: Origin, z: Array, i: int, drawn: Mapping[str, Ar
     made = {"low": low, "high": high, "gamma": np.maximum(np.abs(low), np.abs(high))}
     if name := next((k for k, v in made.items() if not _near(drawn[k], v, size, rounded)), ""):
         return f"{name} of state {i} is drawn otherwise than it is"
-    if o.whole and (np.abs(_apart(o, z, drawn["residual"], i)) > 2 * e.arrays["resolution"][i]).any():
+    if o.text and (np.abs(_apart(o, z, drawn["residual"], i)) > 2 * e.arrays["resolution"][i]).any():
         return f"the residual of state {i} is drawn otherwise than it is"
     return ""
 
@@ -342,7 +342,7 @@ def _slices(e: Evidence, o: Origin, figure: Mapping[str, Any], arrays: Mapping[s
         size, rounded = float(made.max(initial=0.0)), float(e.arrays["remainder.resolution"][i])
         if not _near(gamma[rows], made, size, rounded) or not np.isnan(gamma[~inside]).all():
             return f"γ of state {i} is drawn otherwise than it is"
-        if o.whole and (np.abs(gap[inside] - np.abs(o.residual(z[inside])[:, i])) > 2 * e.arrays["resolution"][i]).any():
+        if o.text and (np.abs(gap[inside] - np.abs(o.residual(z[inside])[:, i])) > 2 * e.arrays["resolution"][i]).any():
             return f"|r| of state {i} is drawn otherwise than it is"
     return ""
 

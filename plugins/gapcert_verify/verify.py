@@ -26,8 +26,10 @@ from .evidence import Evidence, Part, another, bounds, distance, load, predictor
 from .margin import margin
 from .origin import CHECKS as ORIGIN
 from .origin import Check, Origin, origin
+from .origin import again as again_of
 from .presented import FOLDER, root, whole_run
 from .proofs import bent, dominates, exceeds, follows
+from .yardsticks import spent, yardsticks
 
 ROUTES = {
     "envelope": ("dominate",),
@@ -65,6 +67,8 @@ def verify_run(folder: Path | str, allow_code: bool = False, again: int = 0) -> 
         ("the audit has enough points for its ε and β", _enough),
         ("l ≤ r ≤ u at every audited point, as stated", _audit),
         ("figures of the states follow from the audit", stated.figures),
+        ("constant bounds and envelopes follow from samples and constants", yardsticks),
+        ("as many transitions were spent as are stored", spent),
         ("the claim is one that its evidence allows", _claim),
     ]
     if _bare(evidence):
@@ -74,6 +78,7 @@ def verify_run(folder: Path | str, allow_code: bool = False, again: int = 0) -> 
             ("stored data match their digests", _packed),
             ("the held windows give the widening of the band", windows),
             ("figures of the states follow from the held windows", stated.held_figures),
+            ("constant bounds and envelopes follow from samples and constants", yardsticks),
             ("the claim is one that its evidence allows", further),
         ]
     checks += [
@@ -89,6 +94,8 @@ def verify_run(folder: Path | str, allow_code: bool = False, again: int = 0) -> 
         ("the spec is the one that was run", partial(_specified, source)),
         *((name, partial(_asked, check, source)) for name, check in (*ORIGIN, *FOLDER)),
     ]
+    if again and isinstance(source, Origin) and source.whole and "audit" in evidence.data:
+        checks.append(_stepped_again(evidence, source, again))
     results = []
     for name, check in checks:
         outcome = _attempt(check, evidence)
@@ -142,7 +149,7 @@ def _trusted(e: Evidence, source: Origin | str | UsageError) -> list[str]:
         (f"Model, domain, names and what was asked are as stated: {source}.", not isinstance(source, Origin)),
         ("Versions and times are as stated.", True),
     ]
-    whole = isinstance(source, Origin) and source.whole
+    whole = isinstance(source, Origin) and source.text
     if _bare(e):
         return [text for text, so in ((_NOBODY, True), *told) if so]
     if "recording" in e.data:
@@ -189,6 +196,14 @@ def _whence(e: Evidence, allow_code: bool, engine: bool) -> Origin | str | Usage
         return error
     except DAMAGE as error:
         return UsageError(f"spec.json cannot be built: {type(error).__name__}: {error}")
+
+
+def _stepped_again(e: Evidence, source: Origin, n: int) -> tuple[str, Callable[[Evidence], str | None]]:
+    try:
+        name, outcome = again_of(e, source, n)
+    except (*DAMAGE, UsageError) as error:
+        name, outcome = f"{n} stored transitions are stepped again", f"{type(error).__name__}: {error}"
+    return name, lambda _: outcome
 
 
 def _specified(source: Origin | str | UsageError, e: Evidence) -> str | None:
