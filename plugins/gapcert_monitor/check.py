@@ -54,7 +54,8 @@ class Certified:
     def load(cls, folder: Path | str, allow_code: bool = False) -> Certified:
         """From a run's folder: its spec makes the model, its stored certificate the band; the backend is not needed.
 
-        UsageError where `gapcert verify` refuses the folder. Only where the certificate counts hidden states of the backend among its states is the backend built.
+        Only where the certificate counts hidden states of the backend among its states is the backend built. UsageError where
+        `gapcert verify` refuses the folder.
         """
         with damage_told(folder):
             return cls._loaded(Path(folder), allow_code)

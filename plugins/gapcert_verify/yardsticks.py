@@ -103,13 +103,19 @@ def _envelope(e: Evidence) -> Array | None:
     return np.asarray(np.maximum(np.abs(low.lo), np.abs(high.hi)).mean(axis=0))
 
 
+def _transitions(e: Evidence, name: str) -> int:
+    """Those of a round: a row of pairs, under a common hidden state, is two."""
+    points, n = e.folder / "samples" / name / "points.npy", len(e.stored(name)[1])
+    return n * (np.load(points, mmap_mode="r").shape[1] // len(e.zone.low)) if points.exists() else n
+
+
 def spent(e: Evidence) -> str | None:
     """ "" where as many transitions were spent on constants as rounds of them are stored."""
     if not e.data.get("digests"):
         return None
     others = ("bound-", "audit-", "calibration-", "symmetry")
-    counts = {name: len(e.stored(name)[1]) for name in e.data["digests"] if not name.startswith(others)}
-    found, stated = sum(counts.values()), e.data["samples"]["lipschitz"]
+    found = sum(_transitions(e, name) for name in e.data["digests"] if not name.startswith(others))
+    stated = e.data["samples"]["lipschitz"]
     if found != stated:
         return f"{stated} transitions are said to be behind the constants, and {found} are stored"
     pairs = e.data["symmetry"]["pairs"] if e.data.get("symmetry") else None

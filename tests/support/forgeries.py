@@ -2,7 +2,7 @@
 
 A forgery changes one thing that a reader or a check may look at: a field of a JSON object, an entry of an array, a sentence,
 a whole file. What the folder's own files say of each other is then mended from the bottom up: shards in their manifests, rounds
-and arrays in the certificate, that in controllers and summary, the spec in run.json and in the folder's name, the page, the root.
+and arrays in the certificate, that in controllers and summary, the spec in run.json, the page, the root.
 """
 
 from __future__ import annotations
