@@ -194,8 +194,12 @@ def _refuted(data: Mapping[str, Any]) -> bool:
 
 
 def constants(e: Evidence, o: Origin) -> str | None:
-    """Estimator, provenance and safety are the spec's; constants that need no samples are found again."""
-    stated = e.data["lipschitz"]
+    """A declared γ, estimator, provenance and safety are the spec's; constants that need no samples are found again."""
+    gamma = o.asked["family"].stated(states(e))
+    if gamma is not None and not np.array_equal(gamma.arrays()["gamma"], e.arrays["gap.gamma"]):
+        return f"γ is stored as {e.arrays['gap.gamma'].tolist()}, and the spec declares another one"
+    if (stated := e.data.get("lipschitz")) is None:
+        return None if gamma is None else ""
     name, made = _estimator(e, o, stated["method"].partition(" ")[0])
     if stated["method"].partition(" ")[0] != name or stated["provenance"] != made.provenance:
         return f"the constants are stated as {stated['provenance']} by {stated['method']}, and the spec asks for {name}"

@@ -99,7 +99,7 @@ def _envelope(e: Evidence) -> Array | None:
         return None
     if e.data["route"] == "theorem1" and many > 20_000 and e.data["family"] != "envelope":
         return None
-    low, high = envelope(e, z, predictor(e, z, "predictor.audit"))
+    low, high = e.audited if e.data["form"]["form"] == "envelope" else envelope(e, z, predictor(e, z, "predictor.audit"))
     return np.asarray(np.maximum(np.abs(low.lo), np.abs(high.hi)).mean(axis=0))
 
 
