@@ -281,7 +281,7 @@ def stepped(e: Evidence, o: Origin) -> str | None:
         return None
     if not np.allclose(o.residual.resolution(o.domain), e.rounding, rtol=1e-6, atol=0.0):
         return f"e is stated as {e.rounding.tolist()}, and that of f and f̂ is {o.residual.resolution(o.domain).tolist()}"
-    for name, z, r in _rounds(e):
+    for name, z, r in (*_rounds(e), *_further(e)):
         if text := _apart(o, z, r, 2 * e.rounding, name):
             return text
     return _keyed(e, o)
@@ -299,6 +299,15 @@ def _keyed(e: Evidence, o: Origin) -> str:
 def _rounds(e: Evidence) -> Iterator[tuple[str, Array, Array]]:
     yield "samples", *e.samples
     yield "audit", *e.audit
+
+
+def _further(e: Evidence) -> Iterator[tuple[str, Array, Array]]:
+    """What constants were made of: points and residuals; pairs under a common hidden state are none."""
+    for name in e.data["digests"]:
+        if not name.startswith(("bound-", "audit-")) and (e.folder / "samples" / name / "points.npy").exists():
+            z, r = e.round(name)
+            if z.shape[1] == len(e.zone.low):
+                yield name, z, r
 
 
 def _apart(o: Origin, z: Array, r: Array, e: Array, name: str) -> str:

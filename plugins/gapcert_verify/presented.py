@@ -236,7 +236,7 @@ def figures(e: Evidence, o: Origin) -> str | None:
         return None
     with np.load(e.folder / "figures.npz", allow_pickle=False) as stored:
         arrays = {name: stored[name] for name in stored.files}
-    if text := _lanes(drawn) or (_gap(e, o, drawn["gap"], arrays) if drawn["gap"] else ""):
+    if text := _lanes(e, drawn) or (_gap(e, o, drawn["gap"], arrays) if drawn["gap"] else ""):
         return text
     if drawn["recorded"] and (text := _recorded(e, drawn["recorded"], arrays)):
         return text
@@ -246,12 +246,21 @@ def figures(e: Evidence, o: Origin) -> str | None:
 
 
 _STATE = re.compile(r"running|done|finished|holds|fails|unknown|claimed|\d+ violations")
+_STAGE = re.compile(
+    r"run|report|gates|sampling|certificate|lipschitz|fit|calibration|audit|attack|recording|controller|closed_loop|pictures|beside-[\w-]+"
+)
 
 
-def _lanes(drawn: Mapping[str, Any]) -> str:
-    said = [s for lane in drawn["lanes"] for s in (*lane["states"], lane["stage"])]
-    strange = next((s for s in said if not (_STATE.fullmatch(s) or re.fullmatch(r"[\w-]{1,100}", s))), None)
-    return "" if strange is None else f"'{strange}' is no stage, nor how one ends"
+def _lanes(e: Evidence, drawn: Mapping[str, Any]) -> str:
+    """Stages, and the words that they ended with, are those that a run has; the run ended with its verdict."""
+    told = (read(e, "summary.json") or {}).get("verdict")
+    for lane in drawn["lanes"]:
+        strange = [s for s in lane["states"] if not _STATE.fullmatch(s)]
+        if strange or not _STAGE.fullmatch(lane["stage"]):
+            return f"'{strange[0] if strange else lane['stage']}' is no stage, nor how one ends"
+        if lane["stage"] == "run" and lane["states"] not in (["running", told], [told]):
+            return f"the run is drawn to have ended with {lane['states']}, and its verdict is {told}"
+    return ""
 
 
 def _gap(e: Evidence, o: Origin, figure: Mapping[str, Any], arrays: Mapping[str, Array]) -> str:

@@ -58,6 +58,7 @@ def verify_run(folder: Path | str, allow_code: bool = False, again: int = 0) -> 
         ("γ ≥ |r| on every sample of the bound", _samples),
         ("the stored function is the one that samples and constants give", _function),
         ("the margin covers the cover's radius", margin),
+        ("a cover is stated where the samples are one", _covered),
         ("the audit's points are those that its seed draws", _drawn),
         ("sampled and audited points lie in Z", _within),
         ("the declared symmetry holds on the pairs that were looked at", stated.symmetry),
@@ -320,6 +321,8 @@ def _function(e: Evidence) -> str:
         "predictor", kind
     ) != kind:
         return f"'{kind}' is no predictor that is known, or not that of the function"
+    if any(f"gap.{k}" in e.arrays and (e.arrays[f"gap.{k}"] != e.arrays[f"predictor.{k}"]).any() for k in ("offset", "slope")):
+        return "the function subtracts another predictor than the certificate"
     if form == "multilinear":
         return follows(e)
     if form == "envelope":
@@ -338,6 +341,13 @@ def _function(e: Evidence) -> str:
         gamma = [float(g) for g in e.arrays["gap.gamma"]]
         return next((text for i, g in enumerate(gamma) if (text := exceeds(e, i, g))), "")
     return ""
+
+
+def _covered(e: Evidence) -> str:
+    """A cover is stated where the samples are a grid, and there alone."""
+    if (e.folder / "samples" / "bound-0" / "points.npy").exists() != (e.data["cover"] is None):
+        return "a cover is stated of other points, or the points are a grid and none is stated"
+    return "" if e.data["cover"] is None or e.covers() else "the samples are not the grid that the certificate states"
 
 
 def _drawn(e: Evidence) -> str:

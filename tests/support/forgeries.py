@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from gapcert.plugin import load_spec, registry
 from gapcert.run.folder import sealed
 from gapcert_verify import sentences, verify_run
 from gapcert_verify.evidence import load
@@ -228,19 +229,15 @@ class Forger:
     # What a clever forger mends
 
     def mend(self, run: Path, made: Forgery) -> None:
-        with contextlib.suppress(OSError, ValueError, KeyError, TypeError, AttributeError, IndexError):
-            self._rounds(run)
-        with contextlib.suppress(OSError, ValueError, KeyError, TypeError, AttributeError, IndexError):
-            self._certificate(run, made)
-        with contextlib.suppress(OSError, ValueError, KeyError, TypeError, AttributeError, IndexError):
-            self._spec(run)
+        """Every digest above what was changed; what cannot be made of a folder so changed stays."""
+        steps: list[Callable[[Path], Any]] = [self._rounds, lambda r: self._certificate(r, made), self._spec]
         if made.subject != "report.html" and (run / "report.html").exists():
+            steps.append(registry().get("report", "html").load())
+        if (run / "root.json").exists():
+            steps.append(lambda r: (r / "root.json").write_text(json.dumps(sealed(r))))
+        for step in steps:
             with contextlib.suppress(Exception):
-                from gapcert_report.pages.page import write_report
-
-                write_report(run)
-        if (run / "root.json").exists() and made.subject != "root.json":
-            (run / "root.json").write_text(json.dumps(sealed(run)))
+                step(run)
 
     def _rounds(self, run: Path) -> None:
         data = json.loads((run / "certificate.json").read_text())
@@ -284,8 +281,6 @@ class Forger:
         """run.json knows the spec as it is now."""
         if not (run / "spec.json").exists():
             return
-        from gapcert.plugin import load_spec
-
         mark = json.loads((run / "run.json").read_text())
         mark["spec"] = load_spec(json.loads((run / "spec.json").read_text()), folder=Path(mark["folder"])).digest
         (run / "run.json").write_text(json.dumps(mark))
