@@ -24,11 +24,12 @@ from . import statements as stated
 from .calibration import calibrated, further, names, noise, windows
 from .evidence import Evidence, Part, another, bounds, distance, load, predictor
 from .margin import margin
-from .origin import CHECKS as ORIGIN
-from .origin import Check, Origin, origin
-from .origin import again as again_of
-from .presented import FOLDER, root, whole_run
 from .proofs import bent, dominates, exceeds, follows
+from .run_folder.origin import CHECKS as ORIGIN
+from .run_folder.origin import Check, Origin, origin
+from .run_folder.origin import again as again_of
+from .run_folder.pictures import figures, page
+from .run_folder.summary import root, summary, whole_run
 from .yardsticks import spent, yardsticks
 
 ROUTES = {
@@ -40,6 +41,11 @@ ROUTES = {
     "network": ("theorem1",),
 }
 """Route calibrate certifies any of them."""
+FOLDER: tuple[tuple[str, Check], ...] = (
+    ("the summary says what follows", summary),
+    ("pictures show what is stored", figures),
+    ("the page is that of summary and figures", page),
+)
 CLAIMS = ("deterministic", "statistical", "empirical", "assumed")
 PROVENANCES = ("analytic", "interval", "declared", "estimated")
 UNIFORM = "uniform on X × U"
@@ -148,7 +154,7 @@ def _trusted(e: Evidence, source: Origin | str | UsageError) -> list[str]:
     """What the verdict rests on beside the checks."""
     told: list[tuple[str, Any]] = [
         (f"Model, domain, names and what was asked are as stated: {source}.", not isinstance(source, Origin)),
-        ("Versions and times are as stated.", True),
+        ("Versions, times, and budgets of the spec that only a new run could tell are as stated.", True),
     ]
     whole = isinstance(source, Origin) and source.text
     if _bare(e):
@@ -182,7 +188,9 @@ def _trusted(e: Evidence, source: Origin | str | UsageError) -> list[str]:
             e.reduced,
         ),
         ("The declared symmetry holds beyond the pairs that were looked at.", e.data.get("symmetry")),
+        ("The attack with other hidden states is as stated.", whole and "attack" in e.data.get("hidden", {})),
         ("The backend's draws for different seeds are independent.", noise(e)),
+        ("The closed loop was not run again: its counts and traces are as stated.", (e.folder / "closed_loop.npz").exists()),
     ]
     return [text for text, so in told if so]
 
@@ -397,10 +405,28 @@ def _audit(e: Evidence) -> str:
     slack = 64 * np.spacing(np.maximum(np.abs(low.lo), np.abs(high.hi)))
     possible = int(((r < low.hi + slack) | (r > high.lo - slack)).any(axis=1).sum())
     stated, above = e.data["audit"]["violations"], e.data["audit"]["gamma_violations"]
+    if text := _witnessed(e, low, high):
+        return text
     if not certain <= stated <= possible:
         return f"{certain} points lie outside for certain; {stated} were stated"
     least = int((np.abs(r) > np.maximum(np.abs(low.lo), np.abs(high.hi))).any(axis=1).sum())
     return "" if least <= above <= stated else f"|r| > γ at {least} points for certain; {above} were stated"
+
+
+def _witnessed(e: Evidence, low: Interval, high: Interval) -> str:
+    """The witness is the audited point that leaves [l, u] by most, as far as rounding leaves it open."""
+    (z, r), a = e.audit, e.data["audit"]
+    if (w := a.get("witness")) is None:
+        return "violations are stated without a witness" if a["violations"] else ""
+    rows = np.flatnonzero((z == np.asarray(w["z"])).all(axis=1))
+    if not len(rows) or w["at"] != dict(zip(e.data["domain"]["axes"], w["z"], strict=True)):
+        return "the witness is no audited point"
+    k, i = int(rows[0]), w["state"]
+    excess = np.maximum(low.mid - r, r - high.mid)
+    slack = 64 * np.spacing(np.abs([low.mid, high.mid]).max(axis=0)) + e.arrays["remainder.resolution"]
+    same = abs(w["low"] - low.mid[k, i]) <= slack[k, i] and abs(w["high"] - high.mid[k, i]) <= slack[k, i]
+    largest = excess[k, i] >= (excess - slack).max()
+    return "" if same and largest and w["residual"] == r[k, i] else "the witness is another point, or leaves by less"
 
 
 def _claim(e: Evidence) -> str:

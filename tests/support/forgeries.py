@@ -29,10 +29,12 @@ OWN = {"form", "predictor", "domain", "arrays", "versions", "symmetry", "cover",
 """What a certificate stores beside its summary."""
 
 TRUSTED = {
-    r"certificate\.json:versions\..*": "Versions and times",
-    r"summary\.json:timings\..*": "Versions and times",
-    r"progress\.jsonl.*|run\.json:(executor|folder)": "Versions and times",
-    r"summary\.json:run_dir": "Versions and times",
+    r"certificate\.json:versions\..*": "Versions, times",
+    r"spec\.json:sampling\..*|spec\.json:lipschitz\.residual\.(budget|boxes|pairs|distance|cells)": "budgets of the spec",
+    r"spec\.json:((closed_loop|report|expect)\..*|controller\.(horizon|weights|reference|policy).*)": "budgets of the spec",
+    r"summary\.json:timings\..*": "Versions, times",
+    r"progress\.jsonl.*|run\.json:(executor|folder)": "Versions, times",
+    r"summary\.json:run_dir": "Versions, times",
     r"summary\.json:closed_loop\..*|closed_loop\.npz:.*|figures\.(json|npz):/?loop.*": "closed loop",
     r"figures\.(json|npz):.*residual.*|figures\.npz:/gap/slices/\d+/gap": "What only f̂ can tell",
     r"certificate\.json:hidden\..*|certificate\.json:attack\..*": "What only f̂ can tell",
@@ -162,6 +164,8 @@ class Forger:
         with np.load(path, allow_pickle=False) as stored:
             arrays = dict(stored)
         keys = [k for k in sorted(arrays) if arrays[k].size and arrays[k].dtype.kind in "fiub"]
+        if not keys:
+            return None
         key = keys[int(self.rng.integers(len(keys)))]
         was = arrays[key]
         arrays[key] = self.moved(was)

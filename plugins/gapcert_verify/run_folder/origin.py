@@ -43,9 +43,8 @@ from gapcert.plugin import (
     stored,
     widen,
 )
-
-from .evidence import Evidence, bounds
-from .sentences import states
+from gapcert_verify.evidence import Evidence, bounds
+from gapcert_verify.sentences import states
 
 _SAME = 1e-9  # relative: figures that were added up in another order
 
