@@ -29,6 +29,7 @@ from gapcert.plugin import (
     Predictor,
     Request,
     Residual,
+    Samples,
     Symmetry,
     UsageError,
     __version__,
@@ -259,7 +260,9 @@ def predictor(e: Evidence, o: Origin) -> Predictor:
 
 
 def predicted(e: Evidence, o: Origin) -> str | None:
-    """The stored values of a predictor that is a model are that model's."""
+    """An affine predictor is the one that fits the first samples; the stored values of one that is a model are that model's."""
+    if e.data["predictor"] == "affine" == o.asked["family"].predictor:
+        return _affine(e)
     if e.data["predictor"] != "model":
         return None
     if not isinstance(o.asked["predictor"], Model):
@@ -272,6 +275,15 @@ def predicted(e: Evidence, o: Origin) -> str | None:
         if (np.abs(p(z) - e.arrays[f"predictor.{name}"]) > 2 * e_p).any():
             return f"predictor.{name} is not what the extended model gives"
     return ""
+
+
+def _affine(e: Evidence) -> str:
+    z, r = e.round("bound-0") if e.data["digests"] else e.samples
+    made, own = AffinePredictor.fit(Samples(z, r)), (e.arrays["predictor.offset"], e.arrays["predictor.slope"])
+    near = all(
+        np.allclose(a, b, rtol=1e-6, atol=1e-6 * np.abs(r).max()) for a, b in zip((made.offset, made.slope), own, strict=True)
+    )
+    return "" if near else "the affine predictor is another one than fits the first samples"
 
 
 def stepped(e: Evidence, o: Origin) -> str | None:
