@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from gapcert.plugin import Array, on_curvature, order_statistics
+from gapcert.plugin import on_curvature, order_statistics
 
 from .evidence import Evidence
 from .margin import radii
@@ -95,7 +95,7 @@ def words(e: Evidence) -> str:
     return "X × U within its relations" if e.zone.relations else "X × U"
 
 
-def _each(names: Sequence[str], values: Array, digits: int) -> str:
+def _each(names: Sequence[str], values: Sequence[float], digits: int) -> str:
     return ", ".join(f"{n} by {v:.{digits}g}" for n, v in zip(names, values, strict=True))
 
 

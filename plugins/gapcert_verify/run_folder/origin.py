@@ -404,7 +404,8 @@ def _violations(e: Evidence, o: Origin, z: Array, r: Array) -> tuple[Any, Any]:
     gamma = np.maximum(np.abs(low.lo), np.abs(high.hi))
     sure = [(r < low.lo - slack) | (r > high.hi + slack), np.abs(r) > gamma + slack]
     may = [(r < low.hi + slack) | (r > high.lo - slack), np.abs(r) > gamma - 2 * slack]
-    return tuple(np.array([rows.any(axis=1).sum() for rows in both]) for both in (sure, may))
+    counts = [np.array([rows.any(axis=1).sum() for rows in both]) for both in (sure, may)]
+    return counts[0], counts[1]
 
 
 def again(e: Evidence, o: Origin, n: int) -> tuple[str, str]:

@@ -72,8 +72,8 @@ def _gap(e: Evidence, o: Origin, figure: Mapping[str, Any], arrays: Mapping[str,
         own = {"state": axes[i]["name"], "unit": axes[i]["unit"], "axis": axes[j]}
         if any(band[key] != v for key, v in own.items()) or band["constant"] != _constant(e, axes[i]["name"], band, arrays):
             return f"the band of {axes[i]['name']} along {axes[j]['name']} is called, or bounded, otherwise"
-        ends = [float(v[0]) for v in z.chord(z.centre[None], j)]
-        if not _near(points[:, j], np.linspace(*ends, len(points)), np.subtract(*ends[::-1])):
+        low, high = (float(v[0]) for v in z.chord(z.centre[None], j))
+        if not _near(points[:, j], np.linspace(low, high, len(points)), high - low):
             return f"the band along {axes[j]['name']} is drawn at other points"
         if text := _drawn_band(e, o, points, i, {key: arrays[band[key]] for key in ("low", "high", "gamma", "residual")}):
             return text
