@@ -167,7 +167,8 @@ def _trusted(e: Evidence, source: Origin | str | UsageError) -> list[str]:
         ]
         return [text for text, so in told if so]
     origin, why = e.data["lipschitz"], source.why if isinstance(source, Origin) else str(source)
-    constants = f"The constants are {origin['provenance']} ({origin['method']}): with what is warned of slopes, as stated."
+    found = "The constants and the curvature are" if on_curvature(e.data["form"]) else "The constants are"
+    constants = f"{found} {origin['provenance']} ({origin['method']}): with what is warned of slopes, as stated."
     if e.data["route"] == "calibrate":
         constants = "A calibrated band rests on no constants, but on points that no fit has seen: the run's order is trusted."
     proved = origin["provenance"] == "interval" and whole and e.data["predictor"] != "multilinear"

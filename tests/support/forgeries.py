@@ -38,8 +38,8 @@ TRUSTED = {
     r"summary\.json:closed_loop\..*|closed_loop\.npz:.*|figures\.(json|npz):/?loop.*": "closed loop",
     r"figures\.(json|npz):.*residual.*|figures\.npz:/gap/slices/\d+/gap": "What only f̂ can tell",
     r"certificate\.json:hidden\..*|certificate\.json:attack\..*": "What only f̂ can tell",
-    r"samples/.*": "constants are|What only f̂ can tell|stored transitions|order is trusted",
-    r"certificate\.npz:(lipschitz|curvature.*|cells.*)": "constants are",
+    r"samples/.*": "constants|What only f̂ can tell|stored transitions|order is trusted",
+    r"certificate\.npz:(lipschitz|curvature.*|cells.*)": "constants",
     r"certificate\.json:warnings.*": "warned of slopes",
     r"certificate\.npz:(held|fit)\..*|certificate\.json:recording\.rows\..*": "stored transitions",
 }
