@@ -13,6 +13,7 @@ from gapcert.certification.certificate import saved_digest as saved_digest
 from gapcert.certification.certify import predictor_of as predictor_of
 from gapcert.certification.compatibility import unmatched as unmatched
 from gapcert.certification.compatibility import unpaired as unpaired
+from gapcert.certification.contradiction import symmetric as symmetric
 from gapcert.certification.coordinates import Coordinates as Coordinates
 from gapcert.certification.coordinates import RelativeModel as RelativeModel
 from gapcert.certification.coordinates import in_words as in_words
@@ -21,6 +22,7 @@ from gapcert.certification.fingerprint import Fingerprint as Fingerprint
 from gapcert.certification.fingerprint import digest as digest
 from gapcert.certification.gates.augment import forgets as forgets
 from gapcert.certification.gates.augment import widen as widen
+from gapcert.certification.gates.circle import repeating as repeating
 from gapcert.certification.gates.entry import responses as responses
 from gapcert.certification.gates.hidden_distribution import Law as Law
 from gapcert.certification.gates.hidden_distribution import beginning as beginning

@@ -33,6 +33,10 @@ def warnings(e: Evidence) -> str:
     said, known = e.data.get("warnings", []), [*_gates(e), *_slopes(e)]
     if "recording" in e.data:
         return _other("warning", said, list(_recorded(e)))
+    book = damaged(e)
+    if said[len(said) - len(book) :] != book:
+        return f"the warning '{book[0]}' is left out"
+    said = said[: len(said) - len(book)]
     strange = next((w for w in said if not (isinstance(w, str) and any(p.fullmatch(w) for p in known))), None)
     return "" if strange is None else f"'{strange}' is no warning that is known"
 
@@ -120,7 +124,7 @@ def _curvature(e: Evidence) -> Iterator[Said]:
     if not (_bounded(e) and on_curvature(e.data["form"]) and "curvature" in e.arrays):
         return
     provenance = e.data["lipschitz"]["provenance"]
-    proved = "proved by interval arithmetic from the equations of both systems"
+    proved = f"proved by interval arithmetic from the equations of both systems{_but(e)}"
     origin = {"declared": "declared and taken on trust", "interval": proved}.get(provenance, provenance)
     bare = [n for n, row in zip(states(e), e.arrays["curvature"], strict=True) if np.isinf(row).any()]
     rest = f"; where none is known ({', '.join(bare)}) it rests on the Lipschitz constants instead" if bare else ""
@@ -131,13 +135,20 @@ def _curvature(e: Evidence) -> Iterator[Said]:
     )
 
 
+def _but(e: Evidence) -> str:
+    """What is no proof among constants that are called proved."""
+    s = e.data.get("symmetry")
+    open_ = s is not None and not s.get("proved")
+    return f", but for those along {' and '.join(s['names'])}, which rest on the declared symmetry" if s and open_ else ""
+
+
 def _constants(e: Evidence) -> Iterator[Said]:
     if not _bounded(e):
         return
     bound, p = e.data["lipschitz"], e.data["predictor"]
     origin = {
-        "analytic": "were derived analytically",
-        "interval": "were proved by interval arithmetic from the equations of both systems",
+        "analytic": f"were derived analytically{_but(e)}",
+        "interval": f"were proved by interval arithmetic from the equations of both systems{_but(e)}",
         "declared": "were declared by the user and are taken on trust",
         "estimated": f"were estimated by {bound['method']} from {e.data['samples']['lipschitz']} transitions and multiplied by "
         f"{bound['safety']:g}; an estimate is not a bound",
@@ -151,7 +162,7 @@ def _cells(e: Evidence) -> str:
     bound, z = e.data["lipschitz"], e.data["domain"]
     head = f"The constants hold per cell, of {bound['cells']} that tile the domain"
     if not bound["marked"]:
-        proved = "; they were proved in each of them."
+        proved = f"; they were proved in each of them{_but(e)}."
         none = "; none of them is marked: no slope grew as the distance shrank."
         return head + (proved if bound["provenance"] == "interval" else none)
     units = dict(zip(z["axes"], z["units"], strict=True))
@@ -206,7 +217,21 @@ def _noise(made: Mapping[str, Any]) -> str:
 def _resolution(e: Evidence) -> Iterator[Said]:
     if _drawn(e) and "calibration" not in e.data:
         each = ", ".join(f"e({n}) = {v:.2g}" for n, v in zip(states(e), e.rounding, strict=True))
-        yield f"One step of f̂ and of f, as computed, is within e of its exact value: {each}."
+        told = f"One step of f̂ and of f, as computed, is within e of its exact value: {each}"
+        yield f"{told}." if (both := e.data.get("arithmetic")) is None else f"{told}; {_within(both)}.{_terms(e, both)}"
+
+
+def _within(both: Sequence[Mapping[str, Any]]) -> str:
+    """How it is known of f̂ and of f."""
+    proved, stated = "is proved by a running error analysis of the equations", "is assumed as it is stated, not proved"
+    fhat, f = (proved if a["proved"] else stated for a in both)
+    return f"of both it {f}" if fhat == f else f"of f̂ it {fhat}, and of f it {f}"
+
+
+def _terms(e: Evidence, both: Sequence[Mapping[str, Any]]) -> str:
+    """Terms with which text cancels badly."""
+    each = ((n, term, of) for of, a in zip(("f̂", "f"), both, strict=True) for n, term in zip(states(e), a["terms"]) if term)
+    return "".join(f" Most of e({n}) is the rounding of {term} in {of}." for n, term, of in each)
 
 
 def _purity(e: Evidence) -> Iterator[Said]:
@@ -216,9 +241,25 @@ def _purity(e: Evidence) -> Iterator[Said]:
             r"it cannot be had in another process: [\w .:'<>()-]{1,200}"
         )
         yield re.compile(
-            r"f̂ is a function of its arguments alone: repeated and permuted queries(?:, a fresh copy and another worker agreed "
-            rf"bit for bit| and a fresh copy agreed bit for bit \((?:{alone})\)); this was probed, not proved\."
+            rf"f̂ is a function of its arguments alone: repeated and permuted queries, close neighbours, other sizes of call"
+            rf"(?:, a fresh copy and another worker {_AGREED}| and a fresh copy {_AGREED} \((?:{alone})\)); \d+ measured rows, "
+            rf"asked again alone, some after a close neighbour, and half of them in another order, {_AGREED}; this was probed, "
+            r"not proved\."
         )
+
+
+_AGREED = rf"agreed (?:bit for bit|within e, though not bit for bit \(they differ by up to {NUMBER}\))"
+
+
+def _turns(e: Evidence) -> Iterator[Said]:
+    """Angles that close on themselves; which of them do is for the check that knows f and f̂."""
+    known = r"(?:proved by its equations|probed at \d+ states, not proved)"
+    for name in states(e) if _drawn(e) else ():
+        if any(str(a).startswith(f"{name} closes on itself (") for a in e.data["assumptions"]):
+            yield re.compile(
+                rf"{re.escape(name)} closes on itself \((?:the domain spans a turn|f and f̂ are whole turns apart)\); that f "
+                rf"repeats with it was {known}, that f̂ does was {known}\."
+            )
 
 
 def _augmented(e: Evidence) -> Iterator[Said]:
@@ -263,7 +304,8 @@ def _law(e: Evidence, h: Mapping[str, Any]) -> str:
 
 LAWS = re.compile(
     rf"(?:, hidden state (?:at its default|uniform on \S+ ∈ \[{NUMBER}, {NUMBER}\](?: × \S+ ∈ \[{NUMBER}, {NUMBER}\])*|"
-    r"that of one of the \d+ nearest of \d+ states visited in rollouts))?"
+    r"that of one of the \d+ nearest of \d+ states visited in rollouts|in equal parts at its default, as rollouts of up to \d+ "
+    r"steps leave it, and moved from its default as the probe does))?"
 )
 """What a distribution may say of hidden state."""
 
@@ -280,8 +322,11 @@ def _symmetric(e: Evidence) -> Iterator[Said]:
         yield (
             f"The residual does not change when {' and '.join(s['names'])} {'are' if len(s['names']) > 1 else 'is'} shifted: "
             f"declared by the user, and checked on {s['pairs']} pairs of points of Z, which differed by up to "
-            f"{max(s['deviation']):.3g}; the audit does not use it."
+            f"{max(s['deviation']):.3g}; {_PROOF if s.get('proved') else 'nothing proves it'}; the audit does not use it."
         )
+
+
+_PROOF = "interval arithmetic proves it from the equations of both systems"
 
 
 def _scope(e: Evidence) -> Iterator[Said]:
@@ -331,7 +376,8 @@ def _refuted(e: Evidence) -> Iterator[Said]:
             )
     elif _bounded(e) and stated:
         names = "|".join(map(re.escape, states(e)))
-        yield re.compile(rf"REFUTED: two samples contradict the constants of (?:{names}) by {NUMBER}\.")
+        both = rf"(?:: g changes by {NUMBER}, and they allow {NUMBER})?"
+        yield re.compile(rf"REFUTED: two samples contradict the constants of (?:{names}) by {NUMBER}{both}\.")
 
 
 def _windows(e: Evidence) -> Iterator[Said]:
@@ -360,6 +406,35 @@ def _windows(e: Evidence) -> Iterator[Said]:
         f"such transition and {rows['outside']:,} one outside Z or in no whole window; nothing is said of them."
     )
     yield "It does not carry over to other inputs, machines or days, nor to a closed loop that chooses its own points."
+    if once := [copy for copy, _ in copies(e)]:
+        yield f"What is in the recording twice counts once: {'; '.join(once)}. Windows with such rows are left out."
+
+
+def copies(e: Evidence) -> list[tuple[str, str]]:
+    """(copy, warning) of what a recording is said to hold twice; which rows these are the recording alone can tell."""
+    known = re.compile(
+        rf"'.{{1,200}}' (?:is a copy of '.{{1,200}}'|has \d+ rows from {NUMBER} s on that are a copy of rows of '.{{1,200}}')|"
+        r"and \d+ more"
+    )
+    said = [(w.removeprefix(_ONCE), w) for w in e.data.get("warnings", []) if isinstance(w, str) and w.startswith(_ONCE)]
+    return [pair for pair in said if known.fullmatch(pair[0])]
+
+
+_ONCE = "counted once: "
+
+
+def _book(e: Evidence) -> Iterator[Said]:
+    if _drawn(e):
+        yield from (f"Warning: {w}." for w in damaged(e))
+
+
+def damaged(e: Evidence) -> list[str]:
+    """What is wrong with the book, of what the entry says that it found."""
+    book = e.data.get("recording", e.data.get("audit", {})).get("book", {})
+    n = book.get("lost", 0)
+    lost = f"lacks {n} that run folders beside it tell of, so that it was lost or replaced" if n else ""
+    told = " and ".join(filter(None, (lost, "was edited" if book.get("edited") else "")))
+    return [f"the book of audits {told}; what nothing else tells of is not counted"] if told else []
 
 
 ASSUMPTIONS: tuple[Callable[[Evidence], Iterator[Said]], ...] = (
@@ -370,12 +445,14 @@ ASSUMPTIONS: tuple[Callable[[Evidence], Iterator[Said]], ...] = (
     _declared,
     _resolution,
     _purity,
+    _turns,
     _augmented,
     _hidden,
     _warned,
     _symmetric,
     _scope,
     _audited,
+    _book,
     _covered,
     _refuted,
 )
@@ -428,6 +505,7 @@ def _slopes(e: Evidence) -> list[re.Pattern[str]]:
 def _recorded(e: Evidence) -> Iterator[Said]:
     made, period = e.data["recording"], e.data["domain"]["period"]
     rows = made["rows"]
+    yield from (warning for _, warning in copies(e))
     if 2 * rows["no_transition"] > rows["all"]:
         yield (
             f"{rows['no_transition']:,} of {rows['all']:,} rows begin no transition of one period of {period:g} s (the next "
@@ -438,3 +516,4 @@ def _recorded(e: Evidence) -> Iterator[Said]:
             f"this is calibration {made['number']} on the same measurements; fresh ones cannot be drawn from a recording, so "
             f"that one which was chosen by its figures claims too much"
         )
+    yield from damaged(e)

@@ -152,6 +152,7 @@ def _trusted(e: Evidence, source: Origin | str | UsageError) -> list[str]:
         alike = "independent draws of one distribution" if "beta" in e.data["claim"] else "exchangeable"
         told += [
             ("The stored transitions are all of the recording's that begin in Z, and their residuals are those of f.", True),
+            ("Which rows of the recording are copies of others is as stated.", sentences.copies(e)),
             (f"The windows, and the one that the claim is about, are {alike}, chosen before anyone looked at these.", True),
         ]
         return [text for text, so in told if so]
@@ -163,6 +164,12 @@ def _trusted(e: Evidence, source: Origin | str | UsageError) -> list[str]:
     proved = origin["provenance"] == "interval" and whole and e.data["predictor"] != "multilinear"
     told += [
         (f"What only f̂ can tell, residuals, hidden state, purity and attacks, is as stated: {why}.", not whole),
+        ("How f̂ answered when it was asked again is as stated.", not e.data.get("calibration", {}).get("noise")),
+        ("The number of the audit is what the book beside the run folders counted; the book was not looked at.", True),
+        (
+            "The audit's points were drawn by the rule before the book's format 2, from seed and number: a fit could know them.",
+            "book" not in e.data["audit"],
+        ),
         (constants, not proved and e.data["route"] != "declared"),
         ("γ is what a person declares. Samples and audit had the chance to refute it.", e.data["route"] == "declared"),
         (

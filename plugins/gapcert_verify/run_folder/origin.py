@@ -40,10 +40,13 @@ from gapcert.plugin import (
     open_gate,
     overpowered,
     registry,
+    repeating,
     responses,
     stored,
+    symmetric,
     widen,
 )
+from gapcert_verify.calibration import draws
 from gapcert_verify.evidence import Evidence, bounds
 from gapcert_verify.sentences import states
 
@@ -98,6 +101,11 @@ class Origin:
     @cached_property
     def residual(self) -> Residual:
         return Residual(self.gate.system, self.model)
+
+    @cached_property
+    def audited(self) -> Residual:
+        """What audit and attack ask: harmless hidden state is drawn there."""
+        return Residual(self.gate.audited or self.gate.system, self.model)
 
 
 def origin(folder: Path, allow_code: bool = False, engine: bool = False) -> Origin | str:
@@ -298,13 +306,33 @@ def stepped(e: Evidence, o: Origin) -> str | None:
     return _keyed(e, o)
 
 
+def arithmetic(e: Evidence, o: Origin) -> str | None:
+    """What e is, of f̂ and of f, how it is known, and which terms have most of it; of a backend that is no model nothing is."""
+    if (stated := e.data.get("arithmetic")) is None:
+        return None
+    if o.whole:
+        made = [a.to_data() for a in o.residual.arithmetic(o.domain)]
+    else:
+        made = [stated[0], Residual(o.model, o.model).arithmetic(o.domain)[1].to_data()]
+        if stated[0]["proved"] and o.build.spec.component("backend").kind != "model":
+            return "e of f̂ is said to be proved, and f̂ is no text"
+    if not _alike(made, stated):
+        return f"e is stated as {stated}, and follows as {made}"
+    total = np.array(stated[0]["e"]) + np.array(stated[1]["e"])
+    return "" if np.allclose(total, e.rounding, rtol=_SAME, atol=0.0) else "e is not the sum of both"
+
+
 def _keyed(e: Evidence, o: Origin) -> str:
     """The digests that rounds were sampled under, of model, backend and domain."""
-    key = digest(o.model, o.gate.system, o.domain)
-    strange = next((n for n in e.data["digests"] if e.header(n)["key"] != key), "")
+    keys = {own: digest(o.model, r.backend, o.domain) for own, r in ((True, o.audited), (False, o.residual))}
+    strange = next((n for n in e.data["digests"] if e.header(n)["key"] != keys[n.startswith(_UNSEEN)]), "")
     # Another version may have other digests of the same.
     told = strange and e.data["versions"]["gapcert"] == __version__
     return f"round {strange} was sampled of another model, backend or domain" if told else ""
+
+
+_UNSEEN = ("audit-", "calibration-")
+"""Rounds of points that no fit has seen."""
 
 
 def _rounds(e: Evidence) -> Iterator[tuple[str, Array, Array]]:
@@ -322,9 +350,10 @@ def _further(e: Evidence) -> Iterator[tuple[str, Array, Array]]:
 
 
 def _apart(o: Origin, z: Array, r: Array, e: Array, name: str) -> str:
+    own = o.audited if name.startswith(("audit", *_UNSEEN)) else o.residual
     for a in range(0, len(z), 100_000):
         rows = slice(a, a + 100_000)
-        apart = np.abs(difference(o.model.states, o.residual(z[rows]), r[rows]))
+        apart = np.abs(difference(o.model.states, own(z[rows]), r[rows]))
         if (over := (apart > e).any(axis=1)).any():
             k = int(np.argmax(over))
             return f"the residual at {z[rows][k].tolist()} of the {name} is stated as {r[rows][k].tolist()}, and is another one"
@@ -339,9 +368,28 @@ def gates(e: Evidence, o: Origin) -> str | None:
     stated = {k: v for k, v in e.data.get("hidden", {}).items() if k != "attack"}
     if not _alike(hidden, stated):
         return f"hidden state is stated as {stated}, and was found to be {hidden}"
+    turns = list(repeating(o.model, o.asked["backend"], o.domain, o.asked["seed"]))
+    if turns != [a for a in e.data["assumptions"] if " closes on itself (" in a]:
+        return f"of angles that close on themselves follows {turns}, and something else is stated"
     said = responses(o.residual, o.domain, o.asked["seed"])
     stated_warnings = [w for w in e.data.get("warnings", []) if " of f̂ " in w and not w.startswith("The slope")]
     return "" if said == stated_warnings else f"inputs are said to answer as {stated_warnings}, and answer as {said}"
+
+
+def shifted(e: Evidence, o: Origin) -> str | None:
+    """A declared symmetry is proved where the equations of both prove it, and there alone."""
+    if not (s := e.data.get("symmetry")):
+        return None
+    if not o.whole:
+        model = o.build.spec.config.backend is not None and o.build.spec.component("backend").kind == "model"
+        return "the symmetry is said to be proved, and f̂ is no text" if s.get("proved") and not model else ""
+    none = AffinePredictor.none(o.model.nx, len(e.zone.low))
+    backend, seed = o.gate.system, o.asked["seed"]
+    asked = LipschitzProblem(
+        o.domain, none, e.arrays["resolution"], lambda _, z: o.residual(z), o.model, backend, seed, rounding=e.rounding
+    )
+    found = symmetric(asked, Symmetry(tuple(s["names"]), tuple(s["axes"]), s["pairs"], tuple(s["deviation"])))
+    return "" if found.proved == s.get("proved", False) else f"the symmetry is {'' if found.proved else 'not '}proved"
 
 
 def _alike(a: Any, b: Any) -> bool:
@@ -379,12 +427,12 @@ def strength(e: Evidence, o: Origin) -> str | None:
 
 
 def attacked(e: Evidence, o: Origin, most: int = 100_000) -> str | None:
-    """The further points that (seed, 0xA77AC) draws, as far as the first `most`, stepped and judged again."""
+    """The further points that the audit's entry draws, as far as the first `most`, stepped and judged again."""
     if not o.text or not (stated := e.data.get("attack")):
         return None
-    rng, n = np.random.default_rng([o.asked["seed"], 0xA77AC]), stated["points"]
-    z = o.domain.draw(min(n, most), rng)
-    r, zero = o.residual(z), np.zeros(2, dtype=np.int64)
+    n = stated["points"]
+    z = o.domain.draw(min(n, most), draws(e, "attack"))
+    r, zero = o.audited(z), np.zeros(2, dtype=np.int64)
     certain, possible = zero.copy(), zero.copy()
     for a in range(0, len(z), 10_000):
         found = _violations(e, o, z[a : a + 10_000], r[a : a + 10_000])
@@ -410,20 +458,27 @@ def _violations(e: Evidence, o: Origin, z: Array, r: Array) -> tuple[Any, Any]:
 
 def again(e: Evidence, o: Origin, n: int) -> tuple[str, str]:
     """n stored transitions, evenly chosen, stepped by f̂ and f once more: how they agree, and "" where they do within 2 e."""
-    z, r = (np.concatenate(parts) for parts in zip(*((z, r) for _, z, r in _rounds(e)), strict=True))
-    pick = np.unique(np.linspace(0, len(z) - 1, min(n, len(z))).astype(int))
-    z, r = z[pick], r[pick]
-    same = np.array_equal(o.residual(z), r)
+    rounds = list(_rounds(e))
+    total = sum(len(z) for _, z, _ in rounds)
+    pick = np.unique(np.linspace(0, total - 1, min(n, total)).astype(int))
+    first, same, text = 0, True, ""
+    for name, z, r in rounds:
+        rows = pick[(pick >= first) & (pick < first + len(z))] - first
+        own, first = o.audited if name == "audit" else o.residual, first + len(z)
+        same = same and np.array_equal(own(z[rows]), r[rows])
+        text = text or _apart(o, z[rows], r[rows], 2 * e.rounding, name)
     how = "are the same bit for bit" if same else "agree within e, not bit for bit"
-    return f"{len(z)} stored transitions, stepped again, {how}", _apart(o, z, r, 2 * e.rounding, "samples") or _keyed(e, o)
+    return f"{len(pick)} stored transitions, stepped again, {how}", text or _keyed(e, o)
 
 
 CHECKS: tuple[tuple[str, Check], ...] = (
     ("names, ranges and level are those that the spec asks for", question),
     ("constants come from what the spec asks for", constants),
     ("the predictor is the model that the spec names", predicted),
+    ("e of f and f̂ is known as it is said to be", arithmetic),
     ("residuals and e are those of the spec's f and f̂, stepped again", stepped),
     ("hidden state and inputs do what is said of them", gates),
+    ("the declared symmetry is proved where it is said to be", shifted),
     ("what γ leaves to the inputs is as the model says", strength),
     ("the attack's points are judged as stated", attacked),
 )
