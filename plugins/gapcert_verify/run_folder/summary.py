@@ -25,7 +25,7 @@ from gapcert_verify.sentences import states
 
 from .origin import Origin
 
-_OWN = {"form", "predictor", "domain", "arrays", "versions", "symmetry", "cover", "seed", "digests"}
+_OWN = {"form", "predictor", "domain", "arrays", "versions", "symmetry", "cover", "seed", "digests", "arithmetic"}
 """What a certificate stores beside its summary."""
 
 
