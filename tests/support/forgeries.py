@@ -25,7 +25,7 @@ from gapcert.run.folder import sealed
 from gapcert_verify import sentences, verify_run
 from gapcert_verify.evidence import load
 
-OWN = {"form", "predictor", "domain", "arrays", "versions", "symmetry", "cover", "seed", "digests"}
+OWN = {"form", "predictor", "domain", "arrays", "versions", "symmetry", "cover", "seed", "digests", "arithmetic"}
 """What a certificate stores beside its summary."""
 
 TRUSTED = {
