@@ -104,7 +104,7 @@ class Certified(Statement):
         from gapcert.plugin import Build, ModelPredictor, load_spec, regular, widen
 
         evidence, data = load(where), _stored(where, "spec.json")
-        if failed := next((c for c in verify_run(where, allow_code)["checks"] if not c["passed"]), None):
+        if failed := next((c for c in verify_run(where, allow_code=allow_code)["checks"] if not c["passed"]), None):
             raise UsageError(f"{where}: is not what it claims ({failed['check']}: {failed['detail']}); run the spec again")
         home = Path(_stored(where, "run.json").get("folder", "."))
         # What is not asked for need not be there: neither engines nor their files.

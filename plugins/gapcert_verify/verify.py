@@ -89,8 +89,6 @@ def verify_run(folder: Path | str, emit: Emit = silent, *, allow_code: bool = Fa
             ("constant bounds and envelopes follow from samples and constants", yardsticks),
             ("the claim is one that its evidence allows", further),
         ]
-    controller = controlled(evidence, emit)
-    checks += [] if controller is None else controller.checks
     checks += [
         ("constants come from what they are said to come from", _method),
         ("assumptions are those that the data give", sentences.assumptions),
@@ -105,6 +103,8 @@ def verify_run(folder: Path | str, emit: Emit = silent, *, allow_code: bool = Fa
     ]
     if again and isinstance(source, Origin) and source.whole and "audit" in evidence.data:
         checks.append(_stepped_again(evidence, source, again))
+    controller = controlled(evidence, emit)
+    checks += [] if controller is None else controller.checks
     results = []
     for name, check in checks:
         outcome = _attempt(check, evidence)
