@@ -230,7 +230,8 @@ def _within(both: Sequence[Mapping[str, Any]]) -> str:
 
 def _terms(e: Evidence, both: Sequence[Mapping[str, Any]]) -> str:
     """Terms with which text cancels badly."""
-    each = ((n, term, of) for of, a in zip(("f̂", "f"), both, strict=True) for n, term in zip(states(e), a["terms"]) if term)
+    systems = zip(("f̂", "f"), both, strict=True)
+    each = ((n, term, of) for of, a in systems for n, term in zip(states(e), a["terms"], strict=False) if term)
     return "".join(f" Most of e({n}) is the rounding of {term} in {of}." for n, term, of in each)
 
 

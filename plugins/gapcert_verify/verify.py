@@ -167,7 +167,7 @@ def _trusted(e: Evidence, source: Origin | str | UsageError) -> list[str]:
         ("How f̂ answered when it was asked again is as stated.", not e.data.get("calibration", {}).get("noise")),
         ("The number of the audit is what the book beside the run folders counted; the book was not looked at.", True),
         (
-            "The audit's points were drawn by the rule before the book's format 2, from seed and number: a fit could know them.",
+            "The audit's points were drawn by the rule before the book's format 2, of seed and number: a fit could know them.",
             "book" not in e.data["audit"],
         ),
         (constants, not proved and e.data["route"] != "declared"),

@@ -149,7 +149,7 @@ class Fingerprint:
             from scipy.optimize import linprog
 
             rows, box = np.eye(len(zone.low)), list(zip(zone.low, zone.high, strict=True))
-            found = [[linprog(s * row, zone.matrix, zone.bounds, bounds=box).x @ row for row in rows] for s in (1, -1)]
+            found = [[linprog(s * row, zone.matrix, zone.bounds, bounds=box).fun * s for row in rows] for s in (1, -1)]
             ends = np.array(found)
         return np.asarray(ends * self._unit)
 
