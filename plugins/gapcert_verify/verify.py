@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from gapcert.plugin import DAMAGE, Array, Emit, Interval, UsageError, on_curvature, silent
+from gapcert.plugin import DAMAGE, Array, Emit, GapcertError, Interval, UsageError, on_curvature, silent
 
 from . import sentences
 from . import statements as stated
@@ -200,7 +200,7 @@ def _whence(e: Evidence, allow_code: bool, engine: bool) -> Origin | str | Usage
         return origin(e.folder, allow_code, engine)
     except UsageError as error:
         return error
-    except DAMAGE as error:
+    except (*DAMAGE, GapcertError) as error:
         return UsageError(f"spec.json cannot be built: {type(error).__name__}: {error}")
 
 
@@ -227,7 +227,7 @@ def _attempt(check: Callable[[Evidence], str | None], evidence: Evidence) -> str
         return check(evidence)
     except DAMAGE as error:
         return f"the stored data are incomplete: {type(error).__name__}: {error}"
-    except UsageError as error:
+    except GapcertError as error:
         return str(error)
 
 

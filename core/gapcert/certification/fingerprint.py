@@ -149,8 +149,8 @@ class Fingerprint:
             from scipy.optimize import linprog
 
             rows, box = np.eye(len(zone.low)), list(zip(zone.low, zone.high, strict=True))
-            found = [[linprog(s * row, zone.matrix, zone.bounds, bounds=box).fun * s for row in rows] for s in (1, -1)]
-            ends = np.array(found)
+            found = [[linprog(s * row, zone.matrix, zone.bounds, bounds=box).x for row in rows] for s in (1, -1)]
+            ends = np.array([np.diag(np.array(corners)) for corners in found])
         return np.asarray(ends * self._unit)
 
     def _inside(self, ends: Array, order: Sequence[int]) -> Bools:
