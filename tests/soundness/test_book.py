@@ -259,7 +259,7 @@ def certified(folder: Path, seed: int, backend: gc.System | None = None) -> gc.C
 class Constants(gc.plugin.LipschitzEstimator):
     def bound(self, problem: Any) -> gc.plugin.LipschitzBound:
         value = 2 * ripple_lipschitz(1, 2.0) + np.abs(getattr(problem.predictor, "slope", 0.0))
-        return gc.plugin.LipschitzBound(value, 0 * value, "declared", "twice what it is", 2.0)
+        return gc.plugin.LipschitzBound(value, 0 * value, "declared", "twice", 2.0)
 
 
 def said(c: gc.Certificate) -> str:
