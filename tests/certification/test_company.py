@@ -205,6 +205,7 @@ def test_rows_asked_again_are_those_of_both_rounds():
 # Hidden state that a probe found harmless
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("kind", FORGETFUL)
 def test_forgetful_engines_get_no_false_claim(kind, tmp_path):
     for claim in ("deterministic", "statistical"):

@@ -127,7 +127,7 @@ def forged(source: Path, place: Path, seed: int, count: int) -> list[str]:
     return [text for text in found if text]
 
 
-@pytest.mark.contract
+@pytest.mark.exam
 @pytest.mark.parametrize("kind", ["statistical", "controller"])
 def test_a_few_forgeries_are_caught(runs, out, tmp_path, kind):
     assert forged(run_of(runs, kind, out), tmp_path, 3, 6) == []

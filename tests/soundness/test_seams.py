@@ -97,6 +97,7 @@ def played(problem: gc.SynthesisProblem, c: GridController, n: int, steps: int, 
     return count, broken
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("seed", range(10))
 def test_nobody_breaks_a_promise_at_a_seam(seed: int) -> None:
     problem, c = made(seed)

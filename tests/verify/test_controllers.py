@@ -48,6 +48,7 @@ def failures(run):
     return {c["check"]: c["detail"] for c in verify_run(run)["checks"] if not c["passed"]}
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("name", [*specs(), *bands(), "beside", "grown", "extended"])
 def test_honest_controllers_are_proved(runs, name):
     answer = verify_run(runs[name].folder)
@@ -186,6 +187,7 @@ def test_the_model_of_the_spec_is_what_it_is_proved_for(forged, name, part, valu
     assert KEPT in failures(run)
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("name", ["staying", "refined", "circle", "again", "forever", "finer", "held", "beside"])
 def test_drawn_bits_are_caught(runs, forged, name):
     found, rng = runs[name], np.random.default_rng(len(name))

@@ -122,6 +122,7 @@ def test_changed_plans_fail(runs, tmp_path, name):
     assert check in failures(run)
 
 
+@pytest.mark.exam
 def test_of_an_unknown_kind_the_promise_is_trusted_by_name(runs, tmp_path):
     run = shutil.copytree(runs["tracking"], tmp_path / "other")
     retold(run, kind="somebody's")
