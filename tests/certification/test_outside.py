@@ -83,7 +83,7 @@ def test_rows_outside_are_nan_and_named_and_the_others_as_if_asked_alone(seed: i
 
 @pytest.mark.parametrize("seed", range(6))
 def test_an_angle_over_a_full_turn_is_asked_on_its_turn_and_a_narrower_one_is_a_number(seed: int) -> None:
-    """From −20 to 20 turns on, at both ends of the turn and beside them by an ulp: nothing is outside, the band is that of Z."""
+    """From −20 to 20 turns on, at both ends of the turn and beside them by an ulp: nothing is outside of it."""
     rng, axes = np.random.default_rng(seed), (gc.StateSpec("theta", "rad", "angle"), gc.StateSpec("w", "rad/s"))
     low = float(rng.uniform(-4, 1))
     ends = (low, low + 2 * np.pi), (low, low + 3.0)
