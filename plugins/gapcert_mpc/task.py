@@ -125,7 +125,7 @@ class Task:
         names = " and ".join(domain.inputs.names)
         told = f"the inputs are too weak, for γ = 0 too, where {ranges(wider, domain.inputs)} suffices"
         made = self.nothing(f"{names}: {told}; {reason}")
-        return replace(made, evidence=made.evidence | {"change": {"inputs": wider.bounds}})
+        return replace(made, evidence={**made.evidence, "change": {"inputs": wider.bounds}})
 
     def unbounded(self, stages: Stages) -> str | None:
         """Why there can be no tube at all."""

@@ -79,9 +79,8 @@ def jitter(system: System, domain: Domain, seed: int) -> Array | None:
     text = isinstance(system, Model) and system.rounding_over(domain.interval) is not None
     if text or "quaternion" in [s.kind for s in system.states]:
         return None
-    rng = np.random.default_rng([seed, 0x177E])
-    z = domain.draw(THRESHOLDS.jitter_rows, rng)
-    step = np.spacing(np.abs(z)) * rng.choice([-1.0, 1.0], z.shape)
+    z = domain.draw(THRESHOLDS.repeat_rows, np.random.default_rng([seed, 0x177E]))
+    step = np.spacing(np.abs(z)) * np.where(z < domain.centre, 1.0, -1.0)
     near = (z[:, None] + _ULPS[:, None] * step[:, None]).reshape(-1, z.shape[1])
     x = system.step(*map(np.ascontiguousarray, domain.split(near))).x
     y = difference(system.states, x, x[:: len(_ULPS)].repeat(len(_ULPS), axis=0)).reshape(len(z), len(_ULPS), -1)
