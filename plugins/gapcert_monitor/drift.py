@@ -13,7 +13,8 @@ from gapcert_monitor.thresholds import THRESHOLDS
 
 def drift(r: Array, gamma: Array, z: Array) -> dict[str, Any] | None:
     """How much r (n,), without what is known of it, changes along the log: its slope over time beside a quadratic function of
-    z (n, nz). {"change", "error", "samples", "trend"}, or None with too few points.
+    z (n, nz). {"change", "error", "samples", "trend"}; None with too few points, or where time is nearly a function of z: then
+    what r is as a function of z, which need not be quadratic, would look like a trend.
 
     A trend is sure where two errors of the slope agree on it, and told where it is at least `drift_share` of the median γ.
     One takes what is left for an AR(1) process, whose ρ is at the upper end of what is likely: n transitions tell as much as
@@ -30,7 +31,8 @@ def drift(r: Array, gamma: Array, z: Array) -> dict[str, Any] | None:
     time = np.linspace(-0.5, 0.5, n)
     time, left = (v - known @ (known.T @ v) for v in (time, r))
     size = float(time @ time)
-    if size < n * THRESHOLDS.drift_apart:
+    # The mean square of time is 1/12; of what z leaves of it much is lost where the log goes through Z once.
+    if 12 * size < n * THRESHOLDS.drift_apart:
         return None
     change = float(time @ left) / size
     left = left - change * time

@@ -227,7 +227,7 @@ def _meetings(series: Sequence[_Series], within: bool) -> dict[tuple[int, int], 
     for step in sorted({1, *THRESHOLDS.copy_steps, *(r for r in ratios if r <= THRESHOLDS.copy_ratio)}):
         for a, b, fine, shift in _alike(points, step, within):
             rows = np.arange(len(series[b].t))
-            place = step * rows + float(shift) if fine == a else (rows - float(shift)) / step
+            place: Array = step * rows + float(shift) if fine == a else (rows - float(shift)) / step
             found.setdefault((a, b), []).append(place)
     for a, b in itertools.combinations(every, 2) if len(slower) > 1 else ():
         if abs(periods[a] - periods[b]) > 0.02 * periods[a]:
