@@ -6,7 +6,8 @@
 
 Questions are all specs in specs/ and a quick exam (benchmarks/exams), in which an effect is hidden in each recording. Each is
 asked in a process of its own, with one thread. Words, counts and digests must be equal and numbers within a relative tolerance;
-how long something took, and where, is left out.
+how long something took, and where, is left out. An audit's points hang on every bit of what is audited, so on the processor:
+where another function was audited, words are compared and numbers are not.
 """
 
 from __future__ import annotations
@@ -120,8 +121,26 @@ def store() -> None:
     STORED.write_text(json.dumps(answers, indent=1) + "\n")
 
 
+def audited(answer: Any) -> set[str]:
+    """Digests of what was audited, wherever an answer tells of the book."""
+    parts = answer.values() if isinstance(answer, dict) else answer if isinstance(answer, list) else ()
+    own = {answer["audited"]} if isinstance(answer, dict) and "audited" in answer else set()
+    return own.union(*map(audited, parts))
+
+
+def worded(answer: Any) -> Any:
+    """An answer without its numbers, and without digests of the book."""
+    if isinstance(answer, dict):
+        return {key: worded(value) for key, value in answer.items() if key not in ("book", "witness")}
+    if isinstance(answer, list):
+        return [worded(value) for value in answer]
+    return answer if isinstance(answer, bool) else re.sub(r"[-+.,\d]+(e-?\d+)?", "#", str(answer))
+
+
 def differences(a: Any, b: Any, within: float, path: str = "") -> Iterator[str]:
     """Where two answers are not the same."""
+    if not path and audited(a) != audited(b):
+        a, b = worded(a), worded(b)
     if isinstance(a, dict) and isinstance(b, dict):
         for key in sorted(a.keys() | b.keys()):
             if LEFT_OUT.search(key):

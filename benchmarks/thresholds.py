@@ -3,7 +3,8 @@
 All are changed at once, each halved or doubled at random, and a second time the other way round. One by one it would be two
 batteries for each of some five hundred, which takes weeks. Where the verdict or a cause of a question changes, halves of the
 changes are tried, and halves of these, until single thresholds are left (or a few that act together alone). These are set back
-for this question and all that follow; a question whose answer moves yet again after four of these lies on an edge, and is told.
+for this question and all that follow; the cheapest are asked first. An answer that moves yet again after four of these lies on
+an edge, and is told.
 A threshold that is left at the end was changed in every question, one way and the other, and the answers of all others stayed,
 as far as changes do not make up for each other.
 
@@ -210,6 +211,7 @@ def main() -> int:
     items, ended, edges = list[tuple[str, Any, str, str]](), False, [list[str]() for _ in ways]
     with ThreadPoolExecutor(2) as pool, suppress(TimeoutError):
         list(pool.map(lambda question: battery.answer(question, {}), battery.questions))
+        battery.questions.sort(key=lambda question: battery.known[battery.key(question)]["seconds"])
         list(pool.map(battery.decided, ways, found, edges))
         decisive = sorted((key, *of) for one in found for key, of in one.items())
         moved = pool.map(lambda item: battery.moved(item[2], {item[0]: item[1]}), decisive)
@@ -227,6 +229,7 @@ def main() -> int:
     cleared += f", but for {', '.join(tipped)}, whose answers lie on an edge: many changes tip them" if tipped else ""
     state = cleared if ended else "not all is asked: call again"
     print(f"\n{len(battery.questions)} questions: {state}.")
+    print("\n*Alone*: halved or doubled by itself it moves that answer. Others do so only together with some that stand here.")
     return 0
 
 

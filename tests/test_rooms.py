@@ -41,12 +41,13 @@ def test_a_name_from_inside_another_package_is_caught(tmp_path):
 
 @pytest.mark.unit
 def test_verification_shares_no_code_with_fitting(found):
-    """Numbers, bounded functions, networks and the files of cells; no model, no fit, no registry."""
+    """Numbers, contracts, bounded functions, networks and the files of cells; no model, no fit, no registry."""
     modules = rooms.files()
     seen = rooms.reached(found, [m for m in modules if m.startswith("gapcert_verify.")])
-    allowed = {"core.numerics", "gapcert_cells", "gapcert_functions", "gapcert_networks", "gapcert_verify"}
+    allowed = {"core.numerics", "core.contracts", "gapcert_cells", "gapcert_functions", "gapcert_networks", "gapcert_verify"}
     assert {m for m in seen if rooms.room(m) not in allowed} == set()
-    assert "gapcert.contracts.gaps.gap" in rooms.reached(
+    assert "gapcert.contracts.plugins.registry" not in seen
+    assert "gapcert.contracts.plugins.registry" in rooms.reached(
         [*found, rooms.Import("gapcert_verify.verify", "gapcert.certification.certify", "later")], seen
     )
 

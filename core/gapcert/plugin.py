@@ -9,15 +9,17 @@ from gapcert.lazy import LazyPackage, homes
 _HOME = homes(
     {
         "gapcert.certification.certificate": (
-            "Audit Certificate Ledger Record StateEvidence domain_data figures gap_digest saved_digest"
+            "Audit Band Certificate Record SavedStatement StateEvidence Statement domain_data figures gap_digest saved_digest"
         ),
-        "gapcert.certification.certify": "digest predictor_of",
+        "gapcert.certification.certify": "predictor_of",
         "gapcert.certification.compatibility": "unmatched unpaired",
         "gapcert.certification.coordinates": "Coordinates RelativeModel in_words",
         "gapcert.certification.declaration": "Declaration",
+        "gapcert.certification.fingerprint": "Fingerprint digest",
         "gapcert.certification.gates.augment": "forgets widen",
         "gapcert.certification.gates.hidden_distribution": "Law beginning",
         "gapcert.certification.gates.hidden_state": "Gate",
+        "gapcert.certification.ledger": "Entry Ledger",
         "gapcert.certification.refutation": "Trails follow",
         "gapcert.certification.routes": "Findings Request Route",
         "gapcert.certification.samples.executors": "processes",
@@ -37,19 +39,21 @@ _HOME = homes(
         "gapcert.contracts.plugins.options": "ConfigContract Keyed of_config",
         "gapcert.contracts.plugins.presentation": "Shown View view",
         "gapcert.contracts.plugins.component": "ALLOW_CODE EXECUTED LOG RUN Answer Argument Arguments Component Context load",
-        "gapcert.contracts.plugins.registry": "Registry hookimpl registry",
+        "gapcert.contracts.plugins.registry": "Registry hookimpl installed registry",
+        "gapcert.contracts.systems.arithmetic": "Arithmetic",
         "gapcert.contracts.systems.cells": "Cells",
-        "gapcert.contracts.systems.domain": "Box Cover Domain Points",
+        "gapcert.contracts.systems.domain": "Box Cover Domain Outside Points turned",
         "gapcert.contracts.systems.extension": "Extension Memory Parameter",
-        "gapcert.contracts.systems.region": "TURN Ellipsoid Polytope Region turned",
+        "gapcert.contracts.systems.region": "Ellipsoid Polytope Region",
         "gapcert.contracts.systems.scene": "GREY Scene Shape at_rest",
         "gapcert.contracts.systems.system": (
             "Backend Capability EngineHints Extendable Model StateSpec Step System Values Variant cross difference rotated "
             "step_seed"
         ),
         "gapcert.lazy": "LazyPackage homes",
-        "gapcert.numerics": "order_statistics",
+        "gapcert.numerics": "circle order_statistics",
         "gapcert.numerics.arrays": "Array Bools Ints",
+        "gapcert.numerics.circle": "TURN",
         "gapcert.numerics.atomic_files": "DAMAGE damage_told npz_bytes write_atomic",
         "gapcert.numerics.constraint_zone": "Relation Zone grid_at grid_size lattice",
         "gapcert.numerics.counter_rng": "keys normals uniforms",
@@ -61,20 +65,21 @@ _HOME = homes(
         "gapcert.numerics.majorant": "cells_of majorant majorant_of",
         "gapcert.numerics.order_statistics": "missed",
         "gapcert.numerics.texts": "columns leaves times",
-        "gapcert.cli.listing": "entry",
+        "gapcert.cli.terminal": "Terminal",
         "gapcert.run.build": "Build",
-        "gapcert.run.folder": "stored",
-        "gapcert.run.progress_rate": "figure",
+        "gapcert.run.folder": "LOCK MARK is_run owned stored",
+        "gapcert.run.progress_rate": "duration figure",
         "gapcert.run.run": "Outcome Study cpu_seconds",
-        "gapcert.run.status": "RunFolder",
+        "gapcert.run.status": "RunFolder folders walk",
         "gapcert.run.verdict": "outside share",
+        "gapcert.spec.check": "COMPONENTS",
         "gapcert.spec.compose": "regular",
         "gapcert.spec.models": "near unknown_key validate",
         "gapcert.spec.relations": "backend_axes",
         "gapcert.spec.sections": "sections",
         "gapcert.spec.sections.plugin_sections": "Axes Checker Drawn Schema SpecSection",
         "gapcert.spec.sections.sections": (
-            "Bound Boxes Config Count HiddenConfig Name Probability Seconds Section Share Time Whole"
+            "Bound Boxes Config Count HiddenConfig Name Probability SECTIONS Seconds Section Share Time Whole"
         ),
         "gapcert.spec.source": "At Problem read",
         "gapcert.spec.spec": "load_spec",

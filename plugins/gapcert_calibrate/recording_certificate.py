@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import json
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -16,8 +15,10 @@ import numpy.typing as npt
 
 from gapcert.plugin import (
     Array,
+    Band,
     Claim,
     Domain,
+    Entry,
     GapFamily,
     GapProblem,
     Ints,
@@ -27,28 +28,26 @@ from gapcert.plugin import (
     Predictor,
     Recording,
     Samples,
-    Shown,
+    SavedStatement,
     StateEvidence,
     UsageError,
     __version__,
     beta_of,
-    domain_data,
     figures,
     gap_digest,
     in_words,
-    npz_bytes,
     order_statistics,
     predictor_of,
     registry,
-    write_atomic,
 )
-from gapcert_monitor import Certified, Check, Monitor, check
+from gapcert_monitor import Certified
 from gapcert_recordings import Copies, Transitions
 
 from .route import CalibratedGap, NoConstants, constant, ends, scale_of
 
 CALLER = "calibration"
 FIT = 1 / 3  # the share of windows that a fit is given
+_SKETCH = 64  # hashes of transitions that stand for a recording: enough to see what two have in common; chosen, not measured
 _FITTED = 300  # transitions that a fit is given: neighbours in time say nearly the same, and scores are made again with each
 
 
@@ -129,12 +128,12 @@ class Windows:
 
 @final
 @dataclass(frozen=True, repr=False)
-class CalibratedRecording(Shown):
+class CalibratedRecording(SavedStatement):
     """A band that holds for all transitions of a further window, with probability 1 − ε on average over calibrations.
 
     `units` windows met Z; those of `fit` gave the band, those of `held` its widening: score · scale, (nx,), with the score of
-    `rank` among their `scores`. `states` are figures over the transitions of the held windows. number: which calibration on
-    these measurements it is, where a ledger counts them.
+    `rank` among their `scores`. `states` are figures over the transitions of the held windows. entry: which calibration on
+    these measurements it is, where a book counts them.
     """
 
     gap: CalibratedGap
@@ -150,18 +149,21 @@ class CalibratedRecording(Shown):
     score: float
     scores: Array
     states: Mapping[str, StateEvidence]
-    number: int | None = None
+    entry: Entry | None = None
     versions: Mapping[str, str] = field(default_factory=dict)
     window: float | None = None
 
     @property
     def certified(self) -> Certified:
         """For `check`, which holds other recordings against the band."""
-        return Certified(self.model, self.problem.domain.zone, self.gap.interval, None, self.claim, self.window)
+        return Certified.of(self)
 
     @property
     def domain(self) -> Domain:
         return self.problem.domain
+
+    def _about(self) -> tuple[Domain, Band]:
+        return self.domain, self.gap.interval
 
     @property
     def vacuous(self) -> bool:
@@ -185,28 +187,16 @@ class CalibratedRecording(Shown):
                 f"{self.model.period:g} s (the next row is late, early or missing, a value is missing, or the input moved); "
                 f"the claim is about the others"
             )
-        if self.number is not None and self.number > 1:
+        if self.entry is not None and self.entry.k > 1:
             said.append(
-                f"this is calibration {self.number} on the same measurements; fresh ones cannot be drawn from a recording, so "
+                f"this is calibration {self.entry.k} on the same measurements; fresh ones cannot be drawn from a recording, so "
                 f"that one which was chosen by its figures claims too much"
             )
-        return said
-
-    def check(self, recording: Recording, noise: Mapping[str, float] | None = None) -> Check:
-        """New measurements against γ; noise: by how much channels may err, in the model's units."""
-        return check(self.certified, recording, noise)
-
-    def monitor(self) -> Monitor:
-        """γ watched online, one transition at a time."""
-        return Monitor(self.certified)
+        return [*said, *([] if self.entry is None else self.entry.warnings)]
 
     def digest(self) -> str:
         """Identity of the band and of its claim."""
         return f"recording:{gap_digest(self.gap, self.problem)}:{self.claim.epsilon!r}:{self.claim.beta!r}"
-
-    def gamma(self, x: Array, u: Array) -> Array:
-        """γ(x, u): x (n, nx), u (n, nu) → (n, nx)."""
-        return self.gap.gamma(np.hstack([x, u]))
 
     def summary(self) -> dict[str, Any]:
         measured = {
@@ -227,36 +217,21 @@ class CalibratedRecording(Shown):
             "samples": {"bound": len(self.problem.samples), "calibration": len(self.held.z)},
             "vacuous": self.vacuous,
             "lipschitz": self.problem.lipschitz.summary(self.domain.axes),
-            "recording": measured | ({} if self.number is None else {"number": self.number}),
+            "recording": measured | ({} if self.entry is None else self.entry.summary()),
             **({"warnings": said} if (said := self.warnings) else {}),
         }
 
     def save(self, folder: Path | str) -> None:
         """`certificate.json` and `certificate.npz`, with all transitions: `gapcert verify` makes rank and scores again."""
-        p, where = self.problem, Path(folder)
-        arrays: dict[str, npt.NDArray[Any]] = {f"gap.{k}": v for k, v in self.gap.arrays().items()}
-        arrays |= {f"predictor.{k}": v for k, v in p.predictor.arrays().items()}
+        p = self.problem
+        arrays: dict[str, npt.NDArray[Any]] = {f"predictor.{k}": v for k, v in p.predictor.arrays().items()}
         arrays |= {"lipschitz": p.lipschitz.value, "resolution": p.resolution, "remainder.resolution": p.remainder_resolution}
         arrays |= {"fit.z": p.samples.z, "fit.r": p.samples.r, "fit.windows": np.unique(self.fit.window)}
         arrays |= {"held.z": self.held.z, "held.r": self.held.r, "held.window": self.held.window}
         arrays |= {"calibration.scale": self.scale}
         if p.predictor.kind == "model":
             arrays |= {"predictor.samples": p.predictor(p.samples.z), "predictor.calibration": p.predictor(self.held.z)}
-        content, domain = npz_bytes(arrays), p.domain
-        data = {
-            **self.summary(),
-            "form": dict(self.gap.form),
-            "predictor": p.predictor.kind,
-            "domain": domain_data(domain),
-            "cover": None,
-            "seed": p.seed,
-            "digests": {},
-            "arrays": hashlib.sha256(content).hexdigest(),
-            "versions": dict(self.versions),
-        }
-        where.mkdir(parents=True, exist_ok=True)
-        write_atomic(where / "certificate.npz", content)
-        write_atomic(where / "certificate.json", json.dumps(data, indent=1, sort_keys=True).encode())
+        self._write(Path(folder), p.predictor.kind, arrays, cover=None, seed=p.seed, digests={})
 
 
 def calibrate_recording(
@@ -310,6 +285,19 @@ def calibrate_recording(
     return CalibratedRecording(
         band, problem, model, claim, said, units, own, held, scale, rank, score, each, states, versions=versions, window=window
     )
+
+
+def content(made: CalibratedRecording) -> tuple[int, ...]:
+    """What stands for the measurements behind a calibration: the smallest hashes of its transitions, whatever their order,
+    names and units. Two recordings have as large a part of these in common as of all (Broder 1997).
+    """
+    low, width = made.domain.low, made.domain.width
+    z, r = (np.concatenate([getattr(part, k) for part in (made.fit, made.held)]) for k in ("z", "r"))
+    # Shares of the ranges, so that units do not count; sorted, so that the order of the axes does not; and rounded as no logger
+    # rounds, so that few lie between two.
+    shares = np.hstack([np.sort((z - low) / width, axis=1), np.sort(r / width[: r.shape[1]], axis=1)])
+    rows = np.round(shares * 790_569.4).astype(np.int64)
+    return tuple(sorted({int(hashlib.sha256(row.tobytes()).hexdigest()[:16], 16) for row in rows})[:_SKETCH])
 
 
 def _dealt(found: Windows, fit: float, violation: float, beta: float | None, window: float | None) -> int:

@@ -17,8 +17,10 @@ from gapcert.plugin import (
     Array,
     Audit,
     Domain,
+    Entry,
     Event,
     Findings,
+    Fingerprint,
     GapFamily,
     GapFunction,
     GapProblem,
@@ -106,7 +108,7 @@ class Calibration(Record):
 
     z: Array
     r: Array
-    k: int
+    entry: Entry
     scale: Array
     exceedances: int
     score: float
@@ -167,6 +169,7 @@ class Calibration(Record):
             f"It is about that distribution alone: it does not carry over to others, nor to a closed loop, which may stay in "
             f"the part that was missed. The audit's {len(audited.z)} points, drawn afterwards in the same way, are a second "
             f"look: {audited.violations} lie outside, and {audited.limit + 1} or more would refute the claim.",
+            *(f"Warning: {w}." for w in self.entry.warnings),
         ]
 
 
@@ -194,15 +197,16 @@ class Calibrate(Route):
         return "dominate" if "dominate" in family.routes else family.routes[0], drawn(backend, seed)
 
     def band(
-        self, gap: GapFunction, problem: GapProblem, request: Request, store: Store, ledger: Ledger, question: str
+        self, gap: GapFunction, problem: GapProblem, request: Request, store: Store, ledger: Ledger, question: Fingerprint
     ) -> tuple[CalibratedGap, Calibration]:
-        """Calibration k of a question: points from (seed, k, STREAM), as many as ε, β_k = β / 2^k and the exceedances need."""
+        """Calibration k of a question, at points that no fit can know: as many as ε, β_k = β / 2^k and the exceedances need."""
         m, repeats = request.exceedances, request.repeats
         stores = [store, *(_again(store, draw) for draw in range(1, repeats))]
         object_ = f"calibrate:{gap_digest(gap, problem)}:{store.key}:{request.epsilon!r}:{request.beta!r}:{m}:{repeats}"
-        k = ledger.enter(question, object_)
+        entry = ledger.enter(question, "calibration", object_)
+        k = entry.k
         n = order_statistics.points_needed(request.epsilon, request.beta / 2**k, m)
-        z = problem.domain.draw(n, np.random.default_rng([problem.seed, k, order_statistics.STREAM]))
+        z = problem.domain.draw(n, entry.draws(problem.seed, "calibration"))
         store.emit(Event("stage-started", "calibration", {"number": k, "points": n}))
         names = [f"calibration-{k}", *(f"calibration-{k}.{draw}" for draw in range(1, repeats))]
         r = np.stack([own.collect(name, Points(z)) for own, name in zip(stores, names, strict=True)])
@@ -210,7 +214,9 @@ class Calibrate(Route):
         each = scored(r, *ends(gap, z), scale)
         q = order_statistics.ranked(each, n - m)
         w = order_statistics.widening(q, scale)
-        return CalibratedGap(gap, w, problem.arithmetic), Calibration(z, r, k, scale, m, q, w, _noisy(store.residual.backend))
+        return CalibratedGap(gap, w, problem.arithmetic), Calibration(
+            z, r, entry, scale, m, q, w, _noisy(store.residual.backend)
+        )
 
     def refuted(self, problem: GapProblem, gap: GapFunction) -> None:
         """Nothing that its claim rests on: not the constants, nor the samples."""

@@ -134,6 +134,9 @@ class Stochastic(Backend):
     def resolution(self, magnitude: Array) -> Array:
         return self.system.resolution(magnitude)
 
+    def repeats(self, angle: str) -> str | None:
+        return None if self.factors or self.ranges else self.system.repeats(angle)
+
     def digest(self) -> str:
         law = [self.noise, self.jitter, self.factors, self.ranges]
         return json_digest(type(self).__qualname__, self.system.digest(), law)

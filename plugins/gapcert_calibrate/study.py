@@ -8,9 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import final
 
-from gapcert.plugin import Build, Domain, Ledger, Model, Outcome, Recording, Stages, Study
+from gapcert.plugin import Build, Domain, Fingerprint, Ledger, Model, Outcome, Recording, Stages, Study
 
-from .recording_certificate import FIT, CalibratedRecording, calibrate_recording
+from .recording_certificate import FIT, CalibratedRecording, calibrate_recording, content
 
 
 @final
@@ -45,5 +45,7 @@ def calibrated(build: Build, model: Model, recording: Recording) -> CalibratedRe
         seed=c.seed,
     )
     question = json.dumps([model.digest(), recording.digest(), domain.digest_data()])
-    number = Ledger(build.out / "ledger.json").enter(hashlib.sha256(question.encode()).hexdigest(), made.digest())
-    return replace(made, number=number, versions={**made.versions, **build.versions()})
+    named = hashlib.sha256(question.encode()).hexdigest()
+    of = Fingerprint(model, model, domain, content(made), named)
+    entry = Ledger(build.out / "ledger.json").enter(of, "calibration", made.digest())
+    return replace(made, entry=entry, versions={**made.versions, **build.versions()})

@@ -11,10 +11,11 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.plugin import ANYWHERE, Array, Automaton, Bools, Box, Controller, Goal, Ints, Policy, UsageError
+from gapcert.plugin import ANYWHERE, Array, Automaton, Bools, Box, Controller, Goal, Ints, Outside, Policy, UsageError
 
 from .files import loaded, write_saved
 from .grid_controller import GridController
+from .outside import inside_alone, refusal
 
 
 @final
@@ -105,8 +106,8 @@ class AutomatonController(Controller):
     def respond(self, x: Array, memory: Ints, policy: Policy, seed: int = 0, k: int = 0) -> Array:
         x = np.atleast_2d(np.asarray(x, dtype=np.float64))
         if (lost := np.flatnonzero(~self.keeps(x, memory))).size:
-            where = f"{x[lost[0]].tolist()} with memory {int(memory[lost[0]])}"
-            raise UsageError(f"controller: row {lost[0]}: {where} is outside its domain; ask `keeps` before `respond`")
+            told = f"its memory is {int(memory[lost[0]])}"
+            raise refusal(self, x, int(lost[0]), told, "`keeps` before `respond`")
         out = np.empty((len(x), self.parts[0].points.shape[1]))
         for q in np.unique(memory):
             rows = memory == q
@@ -115,8 +116,10 @@ class AutomatonController(Controller):
             out[rows] = self.parts[q].act(x[whole], policy, seed, k)[rows]
         return out
 
-    def act(self, x: Array, policy: Policy, seed: int = 0, k: int = 0) -> Array:
+    def act(self, x: Array, policy: Policy, seed: int = 0, k: int = 0, *, outside: Outside = "raise") -> Array:
         """The inputs of runs that begin at x; later ones have a memory, and ask `respond`."""
+        if outside == "nan":
+            return inside_alone(self, self.parts[0].points.shape[1], x, policy, seed, k)
         x = np.atleast_2d(np.asarray(x, dtype=np.float64))
         return self.respond(x, self.start(x), policy, seed, k)
 

@@ -24,13 +24,16 @@ from gapcert.plugin import (
     Controller,
     Goal,
     Ints,
+    Outside,
     Policy,
     UsageError,
+    circle,
     known,
     turned,
 )
 
 from .files import loaded, write_saved
+from .outside import inside_alone, refusal
 from .successors import Splits, Successors, SuccessorsByLevel
 
 Promised = Successors | SuccessorsByLevel
@@ -130,15 +133,16 @@ class GridController(Controller):
         small = self.splits is None or math.prod(self.counts) <= Splits.PAINTED
         return tuple(p for p in POLICIES if p != "adversarial" or (self.successors is not None and small))
 
-    def act(self, x: Array, policy: Policy, seed: int = 0, k: int = 0) -> Array:
-        """One allowed input per state, chosen as `policies` says; UsageError outside the domain."""
+    def act(self, x: Array, policy: Policy, seed: int = 0, k: int = 0, *, outside: Outside = "raise") -> Array:
+        """One allowed input per state, chosen as `policies` says; UsageError outside the domain, or NaN."""
         known(policy)
+        if outside == "nan":
+            return inside_alone(self, self.points.shape[1], x, policy, seed, k)
         x = np.atleast_2d(np.asarray(x, dtype=np.float64))
         cell = self.cells(x)
         lost = np.flatnonzero((cell < 0) | (self.values[cell] < 0))
         if lost.size:
-            state = ", ".join(f"{a.name} = {v!r}" for a, v in zip(self.goal.stay.axes, x[lost[0]].tolist(), strict=True))
-            raise UsageError(f"controller: row {lost[0]}: {state} is outside its domain; ask `contains` before `act`")
+            raise refusal(self, x, int(lost[0]))
         allowed = self.allowed(cell)
         number = allowed.sum(axis=1, dtype=np.int64)
         if not number.all():
@@ -228,9 +232,7 @@ class GridController(Controller):
     def wraps(self) -> tuple[bool, ...]:
         """Axes of cells that close on themselves: angles over a full turn."""
         kinds = [self.goal.stay.axes[j].kind for j in self.on]
-        return tuple(
-            kind == "angle" and (e[-1] - e[0]) * (1 + 1e-15) >= TURN for kind, e in zip(kinds, self.edges, strict=True)
-        )
+        return tuple(kind == "angle" and circle.spans(e[0], e[-1]) for kind, e in zip(kinds, self.edges, strict=True))
 
     def kept(self, x: Array, u: Array, after: Array, memory: Ints | None = None) -> Bools:
         """(n,): is `after` in a cell of the domain, of smaller value on the way to a target, and in one that was promised?

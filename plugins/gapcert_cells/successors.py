@@ -15,6 +15,13 @@ import numpy.typing as npt
 
 from gapcert.plugin import Array, Bools, Ints
 
+GROWTH = "The successors of cells are bounded by the growth bound that is declared, in floating point; nothing proves it."
+SEEN = (
+    "On which states and inputs the model's successors depend was inferred from random pairs of points per axis, as the model "
+    "encloses no derivatives; a dependence that none of them shows is missed."
+)
+"""What a controller may rest on, in the words of its `assumptions`."""
+
 
 @final
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ from gapcert.plugin import (
     Controller,
     Domain,
     Emit,
+    Entry,
     Ints,
     Law,
     NoStart,
@@ -206,7 +207,7 @@ def _judge(controller: Controller, x: Array, memory: Ints) -> dict[str, Bools]:
     return {"reached": reached, "stranded": stranded, "left_goal": ~controller.goal.holds(x)}
 
 
-def draw_starts(controllers: Sequence[Controller], n: int, seed: int) -> Array:
+def draw_starts(controllers: Sequence[Controller], n: int, seed: int | np.random.Generator) -> Array:
     """n states, uniform on the intersection of the controllers' domains but for the target; NoStart where there are too few."""
     rng = np.random.default_rng(seed)
     found: list[Array] = []
@@ -230,7 +231,9 @@ def draw_starts(controllers: Sequence[Controller], n: int, seed: int) -> Array:
     )
 
 
-def taken_first(with_gamma: Controller, without_gamma: Controller, n: int, seed: int) -> tuple[Array, int]:
+def taken_first(
+    with_gamma: Controller, without_gamma: Controller, n: int, seed: int | np.random.Generator
+) -> tuple[Array, int]:
     """n starts drawn where the controller without γ wins, those first that the one with γ takes, and how many these are."""
     x = draw_starts((without_gamma,), n, seed)
     takes = with_gamma.contains(x)
@@ -406,6 +409,7 @@ def compare_loops(
     domain: Domain | None = None,
     oracle: Oracle | None = None,
     beta: float = 1e-6,
+    entry: Entry | None = None,
     emit: Emit = silent,
 ) -> ClosedLoop:
     """Both controllers on the simulator from the same starts, drawn where both win, under each of the policies that they know.
@@ -414,12 +418,14 @@ def compare_loops(
     starts_from `without_gamma`: drawn where the controller without γ wins; those that the one with γ refuses are counted, and
     left out of its runs, which then begin, as else, uniformly where both win.
     The simulator runs with its true hidden state; `law` says which of them the certificate is about. `oracle` says what the
-    controller with γ was promised. The runs with γ are an audit at confidence 1 − beta.
+    controller with γ was promised. The runs with γ are an audit at confidence 1 − beta: of its β that of the `entry` by which a
+    book counts it, which draws the starts as well, so that no controller can know them; without one, all of it.
     """
+    drawn = seed if entry is None else entry.draws(seed, "starts")
     if starts_from == "both":
-        x0, taken = draw_starts((with_gamma, without_gamma), starts, seed), starts
+        x0, taken = draw_starts((with_gamma, without_gamma), starts, drawn), starts
     else:
-        x0, taken = taken_first(with_gamma, without_gamma, starts, seed)
+        x0, taken = taken_first(with_gamma, without_gamma, starts, drawn)
     asked, both = tuple(policies or ()), {"with_gamma": with_gamma, "without_gamma": without_gamma}
     policies = tuple(dict.fromkeys((policy, *(asked or POLICIES))))
     pairs = [(name, p) for name, c in both.items() for p in policies if p in c.policies or p == policy]
@@ -439,6 +445,6 @@ def compare_loops(
         if p == policy:
             headline[name] = trace
     outside = None if law is None else strange / max(visited, 1)
-    claim = audited(failed, beta, steps, tuple(p for name, p in pairs if name == "with_gamma"))
+    claim = audited(failed, beta, steps, tuple(p for name, p in pairs if name == "with_gamma"), entry)
     skipped = _not_known(asked, both, pairs)
     return ClosedLoop(policy, tuple(rows), headline["with_gamma"], headline["without_gamma"], outside, claim, skipped)

@@ -10,7 +10,7 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.plugin import Array, Bools, Claim, GapFunction, Model, difference, missed
+from gapcert.plugin import Array, Bools, Box, Claim, Entry, GapFunction, Model, difference, missed, turned
 
 STEPS = 2000
 """Steps of a policy that are held against [l, u] where none broke its promise: evaluating a gap may be dear."""
@@ -20,15 +20,16 @@ STARTS = "starts drawn uniformly where both controllers win, the target left out
 @final
 @dataclass(frozen=True)
 class Oracle:
-    """What a step was promised from: x⁺ ∈ f(x, u) + [l, u](x, u)."""
+    """What a step was promised from: x⁺ ∈ f(x, u) + [l, u](x, u), with angles on the turn of `states`."""
 
     model: Model
     gap: GapFunction
+    states: Box | None = None
 
     def outside(self, x: Array, u: Array, after: Array) -> Bools:
         """(n,): the residual of a step that ended in `after` is outside [l, u], or no number: γ is refuted there."""
         r = difference(self.model.states, after, self.model.step(x, u).x)
-        low, high = self.gap.interval(np.hstack([x, u]))
+        low, high = self.gap.interval(np.hstack([x if self.states is None else turned(self.states, x), u]))
         # Asked so that NaN is outside.
         return np.asarray(~((r >= low) & (r <= high)).all(axis=1))
 
@@ -55,13 +56,14 @@ class Oracle:
         return out
 
 
-def audited(failed: Bools, beta: float, steps: int, policies: tuple[str, ...]) -> dict[str, Any]:
+def audited(failed: Bools, beta: float, steps: int, policies: tuple[str, ...], entry: Entry | None = None) -> dict[str, Any]:
     """What independent runs from drawn starts earn: with confidence 1 − β a run from a further start fails, under at least one
-    of the policies, with probability ε at most. failed (starts,): under any policy.
+    of the policies, with probability ε at most. failed (starts,): under any policy. Number k of the `entry` spends β / 2^k.
     """
-    n, v = len(failed), int(failed.sum())
-    claim = Claim("statistical", largest(v, n, beta), beta, f"{STARTS} × policies {', '.join(policies)}, {steps} steps")
-    return {**claim.summary(), "runs": n, "violations": v}
+    n, v, spent = len(failed), int(failed.sum()), beta / 2 ** (0 if entry is None else entry.k)
+    claim = Claim("statistical", largest(v, n, spent), beta, f"{STARTS} × policies {', '.join(policies)}, {steps} steps")
+    warned = {} if entry is None or not entry.warnings else {"warnings": entry.warnings}
+    return {**claim.summary(), "runs": n, "violations": v, **({} if entry is None else entry.summary()), **warned}
 
 
 def largest(v: int, n: int, beta: float) -> float:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from gapcert.plugin import TURN, Array, Bools, Policy, System, pretty, turned
+from gapcert.plugin import Array, Bools, Policy, System, circle, pretty, turned
 
 if TYPE_CHECKING:
     from gapcert.plugin import Controller
@@ -60,7 +60,7 @@ def foreseen(controller: Controller, x: Array, policy: Policy) -> tuple[tuple[Fo
             break
         if k + 1 < made and len(found[0]) > 1:
             centre, low, high = (part[1] for part in found)
-            came = x[k + 1] - TURN * np.round((x[k + 1] - centre) / TURN) * angles
+            came = circle.near(x[k + 1], centre, angles)
             rows.append((came - centre, low - centre, high - centre, ((came >= low) & (came <= high)).all()))
         if len(out) < MOMENTS and k >= wanted:
             # Angles as the picture has them: in the range of the set to stay in.

@@ -1,11 +1,11 @@
 """Declares what this package offers; imports nothing but gapcert."""
 
-from gapcert.plugin import EXECUTED, Argument, Component, hookimpl
+from gapcert.plugin import EXECUTED, Component, hookimpl
 
 
 @hookimpl
 def gapcert_components() -> list[Component]:
-    """The section `compare:`, the command that carries it out, and the one that compares what runs have found."""
+    """The section `compare:`, and the command that carries it out."""
     return [
         Component(
             "study",
@@ -20,17 +20,5 @@ def gapcert_components() -> list[Component]:
             "execute a spec that compares simulators: which, how far apart, and by which setting?",
             "gapcert.cli.commands:execute",
             arguments=EXECUTED,
-        ),
-        Component(
-            "command",
-            "runs compare",
-            "what differs between the specs of runs, and which figures changed beyond noise",
-            "gapcert_compare.run_folders:command",
-            arguments=(
-                Argument(
-                    "RUNS", "run folders, the first of which the others are held against", {"metavar": "RUN", "nargs": "+"}
-                ),
-                Argument("--all", "show figures that are the same, too", {"action": "store_true"}),
-            ),
         ),
     ]

@@ -200,9 +200,8 @@ class Engine(ABC):
     joints: all of them, in the engine's order; base: 13 default numbers where it floats, else empty; parameters: what
     `EngineWorld.set` takes, with the stated values; motors: at most one per joint; thrusters: those that inputs name; rowwise:
     its worlds take native parameters row by row as well, `EngineWorld.set_rows`, so that queries which differ in them share a
-    batch; unsolved: the change of a state per second that a solver of constraints may leave undone; forgets: nothing of a query
-    reaches the last bit of those after it; integrator: of its equations, see `as_section`; friction_after: their dry friction
-    does not feel damping that is solved with the step.
+    batch; unsolved: the change of a state per second that a solver of constraints may leave undone; integrator: of its
+    equations, see `as_section`; friction_after: their dry friction does not feel damping that is solved with the step.
     """
 
     config: EngineConfig
@@ -214,7 +213,6 @@ class Engine(ABC):
     thrusters: tuple[Thruster, ...] = ()
     rowwise: bool = False
     unsolved: float = 0.0
-    forgets: bool = True
     integrator: str = "semi_implicit"
     friction_after: bool = False
 

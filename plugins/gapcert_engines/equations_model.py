@@ -154,6 +154,8 @@ class EngineModel(Model):
     output: Any = partialmethod(_asked, "output")
     output_delays: Any = partialmethod(_asked, "output_delays")
     resolution: Any = partialmethod(_asked, "resolution")
+    rounding_over: Any = partialmethod(_asked, "rounding_over")
+    rounding_terms: Any = partialmethod(_asked, "rounding_terms")
     sites: Any = partialmethod(_asked, "sites")
     force_unit: Any = partialmethod(_asked, "force_unit")
     equations: Any = partialmethod(_asked, "equations")

@@ -22,6 +22,7 @@ from .config import EquationsConfig
 from .mechanics.dynamics import Prepared
 from .programs.arithmetic import ARRAY, INTERVAL, SEEN, Dual, Seen, array_table, dual_table
 from .programs.jets import JET, Jet
+from .programs.rounding import Rounded, rounded
 from .programs.tape import Columns, Table, Tape
 from .programs.trace import Program, trace
 
@@ -196,11 +197,41 @@ class EquationsModel(Model):
             row[:] = [a is b for a, b in zip(after, x, strict=True)]
         return found[which.reshape(-1)]
 
+    def repeats(self, angle: str) -> str:
+        """By what a turn does to each operation of the step, through the integrator, to x⁺ and to what is remembered."""
+        from .programs.winding import WINDING, Winding, unrepeated
+
+        x = [Winding(float(s.name == angle)) for s in self.states]
+        past = [Winding() for _ in self.hidden] if self.hidden else None
+        new, kept = self._columns(WINDING, self._stated, x, [Winding() for _ in self.inputs], past)
+        after = zip((*self.states, *self.hidden), [*new, *(kept or [])], strict=True)
+        return next((why for spec, value in after if (why := unrepeated(spec, value, angle))), "")
+
     def curvature_enclosure(self, z: Interval, axis: int) -> Interval:
         """Derivatives of second order in interval arithmetic; the whole line where a box may hold a kink."""
         if self.definition.dynamics.coupled_friction:
             return super().curvature_enclosure(z, axis)
         return Interval.concatenate([self._bend(z[k : k + _CHUNK], axis) for k in range(0, max(len(z), 1), _CHUNK)])
+
+    def rounding_over(self, z: Interval) -> Array | None:
+        """A running error analysis of the step, whatever evaluates it; None where friction is found by sweeps."""
+        if self.definition.dynamics.coupled_friction:
+            return None
+        parts = [z[k : k + _CHUNK] for k in range(0, max(len(z), 1), _CHUNK)]
+        return np.concatenate([_stacked([c.error for c in self._rounded(part)], len(part)) for part in parts])
+
+    def rounding_terms(self, z: Interval) -> tuple[str, ...]:
+        """By the same analysis."""
+        return tuple(c.cause[1] for c in self._rounded(z))
+
+    def _rounded(self, z: Interval) -> list[Rounded]:
+        parameters = [Rounded.exact(p.value, p.name) for p in self.parameters]
+        axes = (*self.states, *self.inputs)
+        columns = [Rounded.exact(z[:, j], s.name) for j, s in enumerate(axes)]
+        past = [Rounded.exact(v) for v in self.hidden_default] if "hidden" in self.capabilities else None
+        acting, _, known = self._acting(self._stated, columns[self.nx :], past)
+        with np.errstate(all="ignore"):
+            return rounded(self.definition.dynamics, parameters, columns[: self.nx], acting, known)
 
     def output(self, x: Array, u: Array, parameters: Values | None = None) -> Array:
         """`outputs` of the section; by default the state. parameters: a number each, or one per row."""
@@ -330,14 +361,19 @@ class EquationsModel(Model):
         self, table: Table, fixed: _Fixed, x: Columns, u: Columns, past: Columns | None, forces: Any = None
     ) -> tuple[Columns, Columns | None]:
         """One step of any number type: x⁺, and the hidden states to hand on: late inputs, then memories."""
-        dynamics, acting, remembered, known = self.definition.dynamics, list(u), [], past or []
+        acting, remembered, known = self._acting(fixed, u, past)
+        x, z = self.definition.dynamics.step(table, fixed.prepared, x, acting, known, forces)
+        return x, None if past is None else [*remembered, *z]
+
+    def _acting(self, fixed: _Fixed, u: Columns, past: Columns | None) -> tuple[Columns, Columns, Columns]:
+        """(inputs as they act, late inputs to hand on, memories)."""
+        acting, remembered, known = list(u), [], past or []
         for i, memory, weights in fixed.weights if past is not None else ():
             line, known = [u[i], *known[:memory]], known[memory:]
             remembered += line[:memory]
             terms = [w * v for w, v in zip(weights, line, strict=True)]
             acting[i] = sum(terms[1:], terms[0])
-        x, z = dynamics.step(table, fixed.prepared, x, acting, known, forces)
-        return x, None if past is None else [*remembered, *z]
+        return acting, remembered, known
 
     def _from_default(self, table: Table, fixed: _Fixed, z: Columns) -> Columns:
         past = [table["number"](v, 1) for v in self.hidden_default] if "hidden" in self.capabilities else None

@@ -99,6 +99,11 @@ class Band:
     def inside(self) -> bool:
         return bool(np.all((self.low <= self.residual) & (self.residual <= self.high)))
 
+    @property
+    def empty(self) -> Bools:
+        """Where no value lies in it (n,): its lower end is above its upper one."""
+        return np.asarray(self.low > self.high)
+
 
 @final
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import final
 
 import numpy as np
 
-from gapcert.plugin import TURN, Array, Box, Ellipsoid, Goal, Polytope, turned
+from gapcert.plugin import TURN, Array, Box, Ellipsoid, Goal, Polytope, circle, turned
 
 ROUND = 180  # corners that an ellipse is drawn with
 _FLAT = 1e-9  # of the box: nearer corners lie on one side
@@ -83,7 +83,7 @@ def _drawn(part: Part, stay: Box, at: Array) -> Iterator[tuple[str, Array]]:
 def _same(part: Part, hull: Box, stay: Box) -> bool:
     """Is the part the same wherever in `stay` the states that are not drawn are?"""
     for j in range(2, len(stay.axes)):
-        whole = stay.axes[j].kind == "angle" and hull.high[j] - hull.low[j] >= TURN
+        whole = hull.wraps[j]
         if not whole and (hull.low[j] > stay.low[j] or hull.high[j] < stay.high[j]):
             return False
     if isinstance(part, Polytope):
@@ -93,10 +93,10 @@ def _same(part: Part, hull: Box, stay: Box) -> bool:
 
 def _turns(hull: Box, stay: Box) -> Iterator[Array]:
     """Whole turns of the drawn angles that bring the part to `stay`."""
-    ranges = []
-    for j in (0, 1):
-        first, last = ((stay.low[j] - hull.high[j]) / TURN, (stay.high[j] - hull.low[j]) / TURN)
-        ranges.append(range(int(np.ceil(first)), int(np.floor(last)) + 1) if stay.axes[j].kind == "angle" else range(1))
+    ranges = [
+        circle.copies(hull.low[j], hull.high[j], stay.low[j], stay.high[j]) if stay.axes[j].kind == "angle" else range(1)
+        for j in (0, 1)
+    ]
     for turns in itertools.product(*ranges):
         yield TURN * np.array(turns, dtype=np.float64)
 

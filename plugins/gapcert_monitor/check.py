@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,11 +14,15 @@ import numpy.typing as npt
 
 from gapcert import Array, Claim, Interval, Model, Recording, Trajectory, UsageError
 from gapcert.plugin import (
-    TURN,
+    Band,
+    Box,
     Coordinates,
+    Domain,
     Ints,
     RelativeModel,
+    Statement,
     Zone,
+    circle,
     damage_told,
     difference,
     magnitude,
@@ -33,15 +37,13 @@ from gapcert_verify import Evidence, bounds, load, zone
 from .drift import drift as _drift
 
 if TYPE_CHECKING:
-    from gapcert.plugin import Certificate, Declaration, Predictor
+    from gapcert.plugin import Predictor
     from gapcert_recordings import Table
-
-Band = Callable[[Array], tuple[Array, Array]]
 
 
 @final
 @dataclass(frozen=True)
-class Certified:
+class Certified(Statement):
     """What a certificate is about: the model f, the set Z, (l, u) at points of it, and what is claimed of them.
 
     `relative`: where Z and the band are in coordinates (x, w) and the model in (x, u), how w is made. window: in s, where the
@@ -55,9 +57,21 @@ class Certified:
     claim: Claim | None = None
     window: float | None = None
 
+    @cached_property
+    def domain(self) -> Domain:
+        """Z with its names and units."""
+        (low, high), nx = (self.zone.low, self.zone.high), self.model.nx
+        inputs = self.model.inputs if self.relative is None else self.relative.axes
+        return Domain(Box(self.model.states, low[:nx], high[:nx]), Box(inputs, low[nx:], high[nx:]), self.zone.relations)
+
+    def _about(self) -> tuple[Domain, Band]:
+        return self.domain, self.band
+
     @classmethod
-    def of(cls, certificate: Certificate | Declaration) -> Certified:
-        """UsageError where the certificate has lost its model, as one that was unpickled without it."""
+    def of(cls, certificate: Any) -> Certified:
+        """Of any statement; UsageError where it has lost its model, as a certificate that was unpickled without it."""
+        if isinstance(certificate, Certified):
+            return certificate
         model = certificate.model
         if model is None:
             raise UsageError(
@@ -66,7 +80,14 @@ class Certified:
         relative = model.relative if isinstance(model, RelativeModel) else None
         f = model.inner if isinstance(model, RelativeModel) else model
         assert isinstance(f, Model), "the nominal side of a certificate is a model"
-        return cls(f, certificate.domain.zone, certificate.gap.interval, relative, certificate.claim)
+        return cls(
+            f,
+            certificate.domain.zone,
+            certificate.gap.interval,
+            relative,
+            certificate.claim,
+            getattr(certificate, "window", None),
+        )
 
     @classmethod
     def load(cls, folder: Path | str, allow_code: bool = False) -> Certified:
@@ -108,21 +129,17 @@ class Certified:
         return cls(model, zone(evidence.data), _stored_band(evidence, p), relative, claim, length)
 
     def points(self, x: Array, u: Array) -> Array:
-        """z (n, nz) in the coordinates of Z; angles on the turn that is nearest to the middle of Z."""
+        """z (n, nz) in the coordinates of Z; angles on the turn of Z."""
         z = np.concatenate([x, u], axis=1)
-        for j, middle in self._turning:
-            away = z[:, j] - middle
-            # A whole turn is subtracted only where there is one: it is rounded.
-            if not (np.abs(away) <= np.pi).all():
-                turns = np.round(away / TURN)
-                z[:, j] = np.where(turns != 0, z[:, j] - TURN * turns, z[:, j])
+        for j, low, high in self._turning:
+            z[:, j] = circle.onto(low, high, z[:, j])
         return z if self.relative is None else self.relative.over(Interval.exact(z)).mid
 
     @cached_property
-    def _turning(self) -> list[tuple[int, float]]:
-        """(axis, the middle of Z along it) of the states that are angles."""
-        z = self.zone
-        return [(j, (z.low[j] + z.high[j]) / 2) for j, axis in enumerate(self.model.states) if axis.kind == "angle"]
+    def _turning(self) -> list[tuple[int, float, float]]:
+        """(axis, ends of Z along it) of the states that are angles."""
+        kinds = (axis.kind for axis in self.model.states)
+        return [(j, self.zone.low[j], self.zone.high[j]) for j, kind in enumerate(kinds) if kind == "angle"]
 
     def residual(self, x: Array, u: Array, x_next: Array) -> Array:
         """r = x⁺ − f(x, u), (n, nx)."""
@@ -373,7 +390,7 @@ class Monitor:
         axes(certified.model)
         self._certified, zone = certified, certified.zone
         # Where Z is a box in (x, u) itself, of no more than a turn, a point between its ends is in it as it stands.
-        whole = any(zone.high[j] - zone.low[j] > TURN for j, s in enumerate(certified.model.states) if s.kind == "angle")
+        whole = any(zone.high[j] - zone.low[j] > circle.TURN for j, s in enumerate(certified.model.states) if s.kind == "angle")
         plain = certified.relative is None and not zone.relations and not whole
         self._ends = list(zip(zone.low, zone.high, strict=True)) if plain else []
         self.points = self.outside = self.violations = 0

@@ -17,10 +17,13 @@ def check(options: Arguments) -> Answer:
 
 
 def verify(options: Arguments) -> Answer:
-    from gapcert.plugin import columns
+    import sys
+
+    from gapcert.plugin import Terminal, columns
     from gapcert_verify import verify_run
 
-    answer = verify_run(Path(options.run))
+    with Terminal(sys.stderr, options.quiet) as terminal:
+        answer = verify_run(Path(options.run), terminal)
     rows = [("passed" if c["passed"] else "FAILED", c["check"], c["detail"]) for c in answer["checks"]]
     rows += [("trusted", sentence, "") for sentence in answer.get("trusted", ())]
     words = [f"{options.run}: {answer['verdict']}", *columns(("", "check", ""), rows)]

@@ -7,6 +7,7 @@ _NOISE = Argument(
     "by how much a channel may err, such as theta=1e-4",
     {"action": "append", "default": [], "metavar": "CHANNEL=VALUE"},
 )
+_QUIET = Argument("--quiet -q", "no progress", {"action": "store_true"})
 
 
 @hookimpl
@@ -23,8 +24,8 @@ def gapcert_components() -> list[Component]:
         Component(
             "command",
             "verify",
-            "check a certificate again from its stored data",
+            "prove a certificate and its controller again from their stored data",
             "gapcert_monitor.commands:verify",
-            arguments=(RUN,),
+            arguments=(RUN, _QUIET),
         ),
     ]

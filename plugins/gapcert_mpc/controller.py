@@ -13,8 +13,8 @@ from typing import Any, Generic, Protocol, TypeVar, final
 
 import numpy as np
 
-from gapcert.plugin import Array, Bools, Controller, Event, Goal, Ints, Policy, Pulse, UsageError
-from gapcert_cells import loaded, write_saved
+from gapcert.plugin import Array, Bools, Controller, Event, Goal, Ints, Outside, Policy, Pulse, UsageError, circle
+from gapcert_cells import inside_alone, loaded, refusal, write_saved
 
 from .planning.arrival import Arrival
 from .planning.design import Design
@@ -83,19 +83,14 @@ class PlanController(Controller, Generic[R]):
         return ("first",)
 
     @cached_property
-    def _turns(self) -> Array | None:
-        """2π for angles, and infinity for what never comes back; None where nothing does."""
-        turns = np.array([2 * np.pi if axis.kind == "angle" else np.inf for axis in self.goal.stay.axes])
-        return turns if np.isfinite(turns).any() else None
+    def _angles(self) -> Bools:
+        return np.array([axis.kind == "angle" for axis in self.goal.stay.axes])
 
     def framed(self, x: Array) -> Array:
         """States (n, nx) in the frame; angles by the turn that is nearest to its middle."""
         middle, half = self._design.frame.x
-        x, turns = np.atleast_2d(np.asarray(x, dtype=np.float64)) - middle, self._turns
-        if turns is not None and (np.abs(x) > turns / 2).any():
-            some = np.isfinite(turns)
-            x[:, some] -= turns[some] * np.round(x[:, some] / turns[some])
-        return np.asarray(x / half)
+        x = np.atleast_2d(np.asarray(x, dtype=np.float64)) - middle
+        return np.asarray((circle.near(x, 0.0, self._angles) if self._angles.any() else x) / half)
 
     def contains(self, x: Array) -> Bools:
         return np.asarray(self.start(x) > 0)
@@ -125,13 +120,13 @@ class PlanController(Controller, Generic[R]):
         out = np.empty((len(x), len(half)))
         for i, held in enumerate(self.memory.of(memory)):
             if held is None:
-                raise UsageError(
-                    f"controller: row {i}: no plan begins at {np.asarray(x)[i].tolist()}; ask `contains` before `act`"
-                )
+                raise refusal(self, x, i, "no plan begins there")
             out[i] = middle + half * self._input(self.framed(x[i])[0], held)
         return out
 
-    def act(self, x: Array, policy: Policy = "first", seed: int = 0, k: int = 0) -> Array:
+    def act(self, x: Array, policy: Policy = "first", seed: int = 0, k: int = 0, *, outside: Outside = "raise") -> Array:
+        if outside == "nan":
+            return inside_alone(self, 0 if self.design is None else len(self.design.frame.u[0]), x, policy, seed, k)
         return self.respond(x, self.start(np.atleast_2d(x)), policy, seed, k)
 
     def kept(self, x: Array, u: Array, after: Array, memory: Ints | None = None) -> Bools:

@@ -43,7 +43,7 @@ class Mpc(Synthesizer):
         return dict(sorted(self.options.model_dump(exclude={"kind", "adapt", "levels", "terminal"}).items()))
 
     def check(self, model: Model, domain: Domain, goal: Goal) -> None:
-        goal.check(domain)
+        goal.check(domain, model)
         asked = self.options
         if goal.kind != "reach_avoid" and (goal.kind != "invariance" or goal.avoid is not None):
             found = goal.kind if goal.avoid is None else f"{goal.kind} with obstacles"

@@ -67,6 +67,7 @@ class Client:
         pybullet.setPhysicsEngineParameter(
             numSolverIterations=config.solver_iterations,
             solverResidualThreshold=config.solver_residual,
+            deterministicOverlappingPairs=1,
             physicsClientId=self.id,
         )
         self._ground: int | None = None
@@ -82,9 +83,19 @@ class Client:
         self._snapshot = pybullet.saveState(self.id) if self._touches else None
 
     def forget(self) -> None:
-        """Contacts and motors warm-start from the last query; only a restored state forgets them."""
-        if self._snapshot is not None:
-            pybullet.restoreState(self._snapshot, physicsClientId=self.id)
+        """Motors start from the last query until a state is restored. Contacts keep points, impulses and axes of one that was
+        nearly the same until their pair parts, and are solved in the order in which pairs met, unless pairs are sorted.
+        """
+        if self._snapshot is None:
+            return
+        links = range(-1, pybullet.getNumJoints(self.body, self.id))
+        for link in links:
+            pybullet.setCollisionFilterGroupMask(self.body, link, 0, 0, self.id)
+        pybullet.performCollisionDetection(self.id)
+        for link in links:
+            group, mask = (2, -3) if link < 0 and self._fixed else (1, -1)  # as Bullet has them: a fixed base meets what moves
+            pybullet.setCollisionFilterGroupMask(self.body, link, group, mask, self.id)
+        pybullet.restoreState(self._snapshot, physicsClientId=self.id)
 
     def set(self, values: Mapping[str, float]) -> None:
         """Gravity, damping, friction and masses, by the engine's parameter names."""

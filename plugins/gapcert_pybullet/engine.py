@@ -46,8 +46,6 @@ class PyBulletEngine(Engine):
             raise UsageError(f"robot: {self.file} has {count} joints; PyBullet is right up to {JOINTS_AT_MOST}")
         self.base = () if config.fixed_base else tuple(client.base())
         self.parameters = self._native(client)
-        # A contact starts from what one that was nearly the same has found; no restored state forgets all of that.
-        self.forgets = not config.touches
         client.close()
 
     from_config = classmethod(as_backend)

@@ -120,7 +120,8 @@ class _Series:
     @property
     def coarse(self) -> float:
         """How much of each value its digits leave open, on the whole."""
-        return float(np.mean(self.quantum / np.maximum(np.nanmax(np.abs(self.values), axis=0), self.quantum)))
+        size = np.broadcast_to(np.nanmax(np.abs(self.values), axis=0), self.quantum.shape)
+        return float(np.mean(np.divide(self.quantum, size, out=np.zeros(size.shape), where=size > 0)))
 
     @cached_property
     def clock(self) -> float:
@@ -227,8 +228,8 @@ def _meetings(series: Sequence[_Series], within: bool) -> dict[tuple[int, int], 
     for step in sorted({1, *THRESHOLDS.copy_steps, *(r for r in ratios if r <= THRESHOLDS.copy_ratio)}):
         for a, b, fine, shift in _alike(points, step, within):
             rows = np.arange(len(series[b].t))
-            place: Array = step * rows + float(shift) if fine == a else (rows - float(shift)) / step
-            found.setdefault((a, b), []).append(place)
+            place = step * rows + float(shift) if fine == a else (rows - float(shift)) / step
+            found.setdefault((a, b), []).append(np.asarray(place))
     for a, b in itertools.combinations(every, 2) if len(slower) > 1 else ():
         if abs(periods[a] - periods[b]) > 0.02 * periods[a]:
             found.setdefault((a, b), []).extend(_resampled(series[a], series[b]))

@@ -14,7 +14,7 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.plugin import SHORTEST, TURN, Array, Bools, Hold, StateSpec, Trajectory, UsageError, times
+from gapcert.plugin import SHORTEST, TURN, Array, Bools, Hold, StateSpec, Trajectory, UsageError, circle, times
 from gapcert_recordings.thresholds import THRESHOLDS
 
 Rows = npt.NDArray[np.intp]
@@ -219,7 +219,7 @@ def unwrapped(values: Array, t: Array, dt: float, rate: Array | None = None) -> 
         return values
     for before, after in itertools.pairwise(runs):
         expected = out[before[-1]] + _moved(out, t, dt, before, after, rate, wraps)
-        out[after] += TURN * np.round((expected - out[after[0]]) / TURN)
+        out[after] += TURN * circle.turns(expected, out[after[0]])
     return out
 
 

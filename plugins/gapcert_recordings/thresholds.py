@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import final
 
-from gapcert.plugin import chosen
+from gapcert.plugin import chosen, decides
 
 
 @final
@@ -21,7 +21,7 @@ class Thresholds:
     input_jump: float = chosen(4.0, "times its usual change: an input that moved so far unseen cannot be continued")
     unseen_jitter: float = chosen(0.05, "of the noise floor: what uneven times change by less may be taken for even")
     arrival_gain: float = chosen(-0.05, "log of the noise floor, even times over logged: below, these are times of arrival")
-    widest_smooth: float = chosen(0.1, "s on either side of a sample that a smooth curve may look at")
+    widest_smooth: float = decides(0.1, "s on either side of a sample that a smooth curve may look at")
     outlier_scatter: float = chosen(8.0, "times the local scatter, of a value against both sides together")
     one_sided_scatter: float = chosen(3.0, "the same from before and from after, each alone")
     outlier_rounds: int = chosen(20, "of taking out the strangest value of each stretch")

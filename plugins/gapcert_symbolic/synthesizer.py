@@ -13,7 +13,7 @@ import numpy as np
 
 from gapcert import Array, Box, Domain, GapFunction, Goal, MissingDependency, Model, Region, SynthesisProblem, UsageError
 from gapcert.plugin import Bools, Ints, Policy, Pulse, Synthesizer, magnitude
-from gapcert_cells import AutomatonController, GridController, Successors
+from gapcert_cells import GROWTH, SEEN, AutomatonController, GridController, Successors
 from gapcert_symbolic.thresholds import THRESHOLDS
 
 from .cells.abstraction import Windows, check_size, windows
@@ -21,17 +21,13 @@ from .cells.bounds import Bound, Enclosed, Grown, inferred
 from .cells.gaps import Disturbance, disturbance
 from .cells.grid import Grid, combined, multiples, spaced
 from .cells.held import Left, invariant, offered
+from .games.authority import sufficient
 from .games.games import Labels, solve_goal, started, usable
 from .games.reason import in_words, tried, why_empty
 from .games.refinement import Refined, refined
 from .solvers.problem import Dynamics, Problem, Solution
 
 CHUNK = 1 << 20
-TRUSTED = "The successors of cells are bounded by the growth bound that is declared, in floating point; nothing proves it."
-SEEN = (
-    f"On which states and inputs the model's successors depend was inferred from {THRESHOLDS.structure_pairs} random pairs of "
-    "points per axis, as the model encloses no derivatives; a dependence that none of them shows is missed."
-)
 
 
 @final
@@ -92,7 +88,7 @@ class Symbolic(Synthesizer):
 
     def _plan(self, model: Model, domain: Domain, goal: Goal, gap: GapFunction | None) -> _Plan:
         """Cells of the states, values of each input, and the box of the states without cells."""
-        goal.check(domain)
+        goal.check(domain, model)
         if self.refine and self.align == "scots":
             raise UsageError("controller.refine: align: scots is solved on one grid; leave refine out, or put cells on tiles")
         inputs, names = self._ranges(domain), domain.states.names
@@ -163,7 +159,7 @@ class Symbolic(Synthesizer):
         if plan.held is not None:
             evidence["held"] = {n: [a, b] for n, a, b in zip(plan.held.names, plan.held.low, plan.held.high, strict=True)}
         if self.growth is not None:
-            evidence["assumptions"] = [TRUSTED, *([SEEN] if inferred(problem.model, grid, axes) else [])]
+            evidence["assumptions"] = [GROWTH, *([SEEN] if inferred(problem.model, grid, axes) else [])]
         if not found.won(1 if made.beyond else 0):
             evidence |= self._reason(problem, plan, added, made)
         points, solution, labels = combined(axes), found.solution, found.labels
@@ -210,6 +206,7 @@ class Symbolic(Synthesizer):
     def _reason(self, problem: SynthesisProblem, plan: _Plan, added: Disturbance | None, made: _Made) -> dict[str, Any]:
         """Why nothing wins, and what would have to change."""
         grid = plan.grid
+        few = grid.nodes is None and grid.size * made.inputs <= THRESHOLDS.change_pairs
         cause = why_empty(problem, made.labels, added, made.paths, made.safe(), made.target, plan.inputs)
 
         def wins(scale: float, factor: int) -> bool:
@@ -220,9 +217,18 @@ class Symbolic(Synthesizer):
             found = self._made(problem, plan._replace(grid=finer), over)
             return found.won(1 if found.beyond else 0) > 0
 
-        change = tried(wins, grid, made.inputs, added is not None)
+        def held(inputs: Box) -> bool:
+            axes = tuple(spaced(a, b, len(v)) for a, b, v in zip(inputs.low, inputs.high, plan.axes, strict=True))
+            found = self._made(problem, plan._replace(axes=axes, inputs=inputs), None)
+            return found.won(1 if found.beyond else 0) > 0
+
+        change = tried(wins, grid, made.inputs, added is not None) if not cause.of else {}
+        without = not cause.of and added is not None and few and "gap_scale" not in change
+        if few and not change and cause.of != "goal" and (wider := sufficient(held, plan.inputs, cause.needed)) is not None:
+            change["inputs"] = wider.bounds
         beyond = "nothing beyond the target: " if made.won() else ""
-        return {"reason": beyond + cause.text + in_words(change), "change": {**cause.change, **change}}
+        told = in_words(change, plan.inputs, without, few and not cause.of)
+        return {"reason": beyond + cause.text + told, "change": {**cause.change, **change}}
 
 
 @final

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping
 from decimal import Decimal
 from typing import Any
@@ -32,6 +34,32 @@ def noise(e: Evidence) -> str:
     return order_statistics.NOISE if repeats == 1 else order_statistics.NOISE_OF.format(repeats)
 
 
+def draws(e: Evidence, stream: str) -> np.random.Generator:
+    """What the points of audit or calibration are drawn from; without an entry in the book, by the rule from before."""
+    audit = e.data["audit"]
+    book = {k: audit["book"][k] for k in ("question", "audited")} if "book" in audit else {}
+    return order_statistics.drawing(e.data["seed"], audit["number"], stream, **book)
+
+
+def miscounted(e: Evidence) -> str:
+    """ "" where the entry in the book, if there is one, is of the stored function, and of the claim that was asked for."""
+    audit, made = e.data["audit"], e.data.get("calibration")
+    if "book" not in audit:
+        return ""
+    key = e.stored(f"audit-{audit['number']}")[0]["key"]
+    of = hashlib.sha256(json.dumps([e.data["family"], e.data["form"], e.data["seed"]], sort_keys=True).encode())
+    for name, array in sorted(e.arrays.items()):
+        if name.startswith("gap.") and (made is None or not name.startswith("gap.calibrated.")):
+            of.update(name[4:].encode() + np.ascontiguousarray(array).tobytes())
+    text = f"{of.hexdigest()}:{key}:{audit['epsilon']!r}:{audit['beta']!r}"
+    if made is not None:
+        text = f"calibrate:{text}:{made['exceedances']}:{made['repeats']}"
+    kind = "audit" if made is None else "calibration"
+    own = {"number": audit["number"], "kind": kind, "audited": hashlib.sha256(text.encode()).hexdigest()}
+    same = all(audit["book"][k] == v for k, v in own.items()) and audit["book"]["question"]
+    return "" if same else "the entry in the book is not of what was audited"
+
+
 def calibrated(e: Evidence) -> str | None:
     """ "" where points, counts, scale, scores and rank are those that give the stored widening, and the claim its ε and β."""
     stored = [name for name in e.data["digests"] if name.startswith("calibration-")]
@@ -60,12 +88,11 @@ def _points(e: Evidence, z: Array, all_z: list[Array]) -> str:
     if not (0 < epsilon < 1 and 0 < audit["beta"] < 1 and k >= 1):
         return f"ε = {epsilon}, β = {audit['beta']}, calibration {k} are no probabilities of a numbered calibration"
     try:
-        rng = np.random.default_rng([e.data["seed"], k, order_statistics.STREAM])
-        drawn = e.zone.draw(len(z), rng)
+        drawn = e.zone.draw(len(z), draws(e, "calibration"))
     except UsageError as error:
         return str(error)
     if not all(np.array_equal(drawn, other) for other in all_z):
-        return "other points were calibrated with than (seed, k) draws"
+        return "other points were calibrated with than its number and its seed draw"
     if made["points"] != len(z) or e.data["samples"]["calibration"] != len(z) * len(all_z):
         return f"{len(z)} points are stored, {made['points']} and {e.data['samples']['calibration']} are stated"
     if m < 0 or order_statistics.missed(m, len(z), epsilon) > Decimal(audit["beta"] / 2**k):

@@ -10,6 +10,7 @@ from .evidence import Evidence, bounds
 
 _HARMLESS = 4  # resolutions: what a spread may be of arithmetic alone
 AT_REST = ", hidden state at its default"
+DRAWN = ", hidden state in equal parts at its default, "
 
 
 def figures(e: Evidence) -> str:
@@ -60,7 +61,9 @@ def hidden(e: Evidence) -> str | None:
     if not (np.abs(bound - spread) <= slack).all() or ("bound" in h) != drawn:
         return f"the bound over hidden states is stated as {bound.tolist()}, and the resolution holds {spread.tolist()}"
     if h["harmless"]:
-        return f"hidden state is harmless, and is part of a distribution: {h['distribution']}" if h["distribution"] else ""
+        # Older audits asked about its default alone.
+        told = h["distribution"] == "" or (h["distribution"].startswith(DRAWN))
+        return "" if told else f"hidden state is harmless, and the distribution says otherwise: {h['distribution']}"
     if drawn:
         return "" if h["distribution"] not in ("", AT_REST) else "hidden state was drawn, and the distribution does not say how"
     if h["mode"] != "default" or h["distribution"] != AT_REST:

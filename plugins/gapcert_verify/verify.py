@@ -16,10 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from gapcert.plugin import DAMAGE, Array, Interval, UsageError, on_curvature
+from gapcert.plugin import DAMAGE, Array, Emit, Interval, UsageError, on_curvature, silent
 
 from . import statements as stated
-from .calibration import calibrated, further, names, noise, windows
+from .calibration import calibrated, draws, further, miscounted, names, noise, windows
+from .controllers.saved import controlled
 from .evidence import Evidence, Part, another, bounds, distance, load, predictor
 from .margin import margin
 from .proofs import bent, dominates, exceeds, follows
@@ -38,10 +39,10 @@ PROVENANCES = ("analytic", "interval", "declared", "estimated")
 UNIFORM = "uniform on X × U"
 
 
-def verify_run(folder: Path | str) -> dict[str, Any]:
+def verify_run(folder: Path | str, emit: Emit = silent) -> dict[str, Any]:
     """{"verdict": "holds" | "fails", "claim", "checks": [{"check", "passed", "detail"}], "trusted": [sentence]}.
 
-    UsageError where there is no certificate.
+    UsageError where there is no certificate. emit: takes the progress of long proofs.
     """
     evidence = load(Path(folder))
     checks: list[tuple[str, Callable[[Evidence], str | None]]] = [
@@ -70,7 +71,8 @@ def verify_run(folder: Path | str) -> dict[str, Any]:
             ("figures of the states follow from the held windows", stated.held_figures),
             ("the claim is one that its evidence allows", further),
         ]
-    checks.append(("the controller is of this certificate", _controller))
+    controller = controlled(evidence, emit)
+    checks += [] if controller is None else controller.checks
     results = []
     for name, check in checks:
         outcome = _attempt(check, evidence)
@@ -78,26 +80,13 @@ def verify_run(folder: Path | str) -> dict[str, Any]:
             results.append({"check": name, "passed": outcome == "", "detail": outcome})
     verdict = "holds" if all(r["passed"] for r in results) else "fails"
     try:
-        claim, trusted = dict(evidence.data["claim"]), _trusted(evidence)
+        claim = dict(evidence.data["claim"])
+        trusted = [*_trusted(evidence), *(() if controller is None else controller.trusted)]
     except DAMAGE as error:
         raise UsageError(
             f"{folder}: certificate.json is damaged ({type(error).__name__}: {error}); run the spec again"
         ) from None
     return {"verdict": verdict, "claim": claim, "checks": results, "trusted": trusted}
-
-
-def _controller(e: Evidence) -> str | None:
-    """The saved controller names this certificate as the one behind its promise."""
-    saved = e.folder / "controller" / "with_gamma", e.folder / "controller"
-    path = next((p for folder in saved if (p := folder / "controller.json").is_file()), None)
-    if path is None:
-        return None
-    named = json.loads(path.read_text(encoding="utf-8"))["evidence"].get("certificate")
-    own = hashlib.sha256((e.folder / "certificate.json").read_bytes()).hexdigest()
-    if named == own:
-        return ""
-    found = f"rests on certificate {named[:16]}…" if named else "names no certificate"
-    return f"the saved controller {found}, and this one is {own[:16]}…; run the spec again"
 
 
 def _bare(e: Evidence) -> bool:
@@ -150,6 +139,11 @@ def _trusted(e: Evidence) -> list[str]:
         )
     count = e.data["samples"]["bound"] if e.reduced else 0
     told = {
+        "The audit's number is what the book beside the run folders counted; the book was not looked at.": "book"
+        in e.data["audit"],
+        "The audit's points were drawn by the rule before the book's format 2, from seed and number: a fit could know them.": (
+            "book" not in e.data["audit"]
+        ),
         "Hidden state was probed, drawn and attacked as stated: its values are not stored.": e.data.get("hidden"),
         "The texts of the relations say what their coefficients do.": e.zone.relations,
         "The declared symmetry holds beyond the pairs that were looked at.": e.data.get("symmetry"),
@@ -284,13 +278,15 @@ def _function(e: Evidence) -> str:
 
 
 def _drawn(e: Evidence) -> str:
+    """The points are those of the audit's entry in the book, which names this very function."""
+    if text := miscounted(e):
+        return text
     z, _ = e.audit
-    rng = np.random.default_rng([e.data["seed"], e.data["audit"]["number"]])
     try:
-        drawn = e.zone.draw(len(z), rng)
+        drawn = e.zone.draw(len(z), draws(e, "audit"))
     except UsageError as error:
         return str(error)
-    return "" if np.array_equal(z, drawn) else "other points were audited than (seed, k) draws"
+    return "" if np.array_equal(z, drawn) else "other points were audited than its number and its seed draw"
 
 
 def _within(e: Evidence) -> str:
@@ -348,7 +344,8 @@ def _claim(e: Evidence) -> str:
         return f"the audit's points are {drawn}, and the claim states '{e.data['claim']['distribution']}'"
     if kind == "deterministic" and e.data["route"] == "calibrate":
         return "a deterministic claim rests on a calibration"
-    if kind == "deterministic" and (hidden or (e.arrays["resolution"] > e.rounding).any()):
+    matters = bool(hidden) and not e.data["hidden"]["harmless"]
+    if kind == "deterministic" and (matters or (e.arrays["resolution"] > e.rounding).any()):
         return "a deterministic claim rests on drawn hidden states"
     if kind == "deterministic" and provenance == "estimated":
         return "a deterministic claim rests on estimated constants"

@@ -241,3 +241,24 @@ def test_tosses_of_a_cube_beside_free_fall(tmp_path: Path) -> None:
     out = c.held.window[((c.held.r < low) | (c.held.r > high)).any(axis=1)]
     assert len(np.unique(out)) == 243 - 239
     assert verify_run(done.folder)["verdict"] == "holds"
+
+
+def test_measurements_are_the_same_whatever_their_names_units_and_order(here: Path) -> None:
+    """Fresh ones cannot be drawn, so that a second look at them warns, however they are written."""
+    log = recording(90)
+    assert gc.run(SPEC, out="runs").certificate.entry.k == 1
+    logged(here / "m.csv", log, ("time", "place", "push", "n"), scale=1.0)
+    renamed = {
+        "kind": "csv",
+        "files": ["m.csv"],
+        "trajectory": "n",
+        "time": "time",
+        "columns": {"x0": "place", "u0": "push"},
+    }
+    second = gc.run({**SPEC, "name": "again", "recording": renamed}, out="runs").certificate
+    assert second.entry.k == 2
+    assert "this is calibration 2 on the same measurements" in second.warnings[0]
+    logged(here / "log.csv", gc.Recording(tuple(reversed(log.trajectories[20:]))))
+    assert gc.run({**SPEC, "name": "less"}, out="runs").certificate.entry.k == 3
+    logged(here / "log.csv", recording(90, 1))
+    assert gc.run({**SPEC, "name": "fresh"}, out="runs").certificate.entry.k == 1

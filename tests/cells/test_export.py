@@ -189,3 +189,30 @@ def test_what_cannot_be_exported_is_one_sentence(tmp_path: Path, capsys: pytest.
     large = replace(c, values=np.zeros(20_000_000, dtype=np.int32), bits=np.zeros((1, 3), dtype=np.uint8))
     with pytest.raises(UsageError, match="use --to numpy, or fewer cells"):
         export(large, "c", tmp_path)
+
+
+@pytest.mark.contract
+@pytest.mark.parametrize("low", [-np.pi, 0.0, 1.7])
+def test_a_full_turn_has_no_outside(low: float, tmp_path: Path) -> None:
+    """The controller and its program in Python, where every cell wins; C answers as both, as is tested above."""
+    h = StateSpec("h", "rad", "angle")
+    edges = np.linspace(low, low + 2 * np.pi, 12)
+    bits = np.packbits(np.eye(11, dtype=bool), axis=1)
+    c = GridController(
+        Goal("invariance", Box((h,), (low,), (low + 2 * np.pi,))),
+        (edges,),
+        np.arange(11.0)[:, None],
+        bits,
+        np.zeros(11, np.int32),
+        {},
+    )
+    export(c, "numpy", tmp_path)
+    ends = (low + 2 * np.pi * np.arange(-20, 21))[:, None]
+    x = (ends + np.arange(-400, 401) * np.spacing(np.abs(ends))).reshape(-1, 1)
+    x = np.concatenate([x, np.random.default_rng(0).uniform(-130, 130, (20_000, 1))])
+    assert c.contains(x).all()
+    assert np.array_equal(imported(tmp_path / "controller.py").Controller().act(x), c.act(x, "first"))
+    # What the cell says is where the angle is, but for what 20 turns round by.
+    inside = np.mod(x[:, 0] - low, 2 * np.pi)
+    off = np.abs(inside - 2 * np.pi / 11 * (c.act(x, "first")[:, 0] + 0.5))
+    assert (np.minimum(off, 2 * np.pi - off) <= np.pi / 11 + 1e-13).all()

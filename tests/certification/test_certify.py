@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert.certification.certificate import Ledger
 from gapcert.certification.certify import _violations
+from gapcert.certification.fingerprint import Fingerprint
+from gapcert.certification.ledger import Ledger
 from gapcert.certification.routes import Request
 from gapcert.certification.samples.designs import AdaptiveSampling, GridSampling
 from gapcert.contracts.gaps.claim import audit_size
@@ -39,6 +40,11 @@ def certify(tmp_path, **options):
     options = {"lipschitz": Known(), "family": gc.registry().build("gap_family", "envelope"), **options}
     options.setdefault("folder", tmp_path / "run")
     return gc.certify(model, backend, gc.Domain.of(model, RANGES), **options)
+
+
+def question(period: float = 0.1) -> Fingerprint:
+    model = Drift(1, period)
+    return Fingerprint(model, Perturbed(model, ripple), gc.Domain.of(model, RANGES))
 
 
 def test_the_bound_holds_on_points_nobody_sampled(tmp_path):
@@ -223,10 +229,11 @@ def test_every_further_audit_of_a_question_costs_more(tmp_path):
 
 
 def test_an_audit_that_was_begun_counts(tmp_path):
-    ledger = Ledger(tmp_path / "ledger.json")
-    assert [ledger.enter("q", d) for d in ("a", "b", "a", "c")] == [1, 2, 1, 3]
-    assert Ledger(tmp_path / "ledger.json").enter("q", "d") == 4
-    assert ledger.enter("another question", "a") == 1
+    ledger, asked = Ledger(tmp_path / "ledger.json"), question()
+    assert [ledger.enter(asked, "audit", d).k for d in ("a", "b", "a", "c")] == [1, 2, 1, 3]
+    assert Ledger(tmp_path / "ledger.json").enter(question(), "audit", "d").k == 4
+    assert ledger.enter(asked, "calibration", "a").k == 1
+    assert ledger.enter(question(0.2), "audit", "a").k == 1
 
 
 def test_no_fit_sees_the_audit(tmp_path):

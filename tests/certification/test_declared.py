@@ -7,6 +7,7 @@ import pytest
 
 import gapcert as gc
 import gapcert_cells
+from gapcert.certification import contradiction
 from gapcert.numerics.errors import GapcertError
 from gapcert_cells.testing import Band
 from gapcert_verify.verify import verify_run
@@ -113,12 +114,23 @@ def test_a_simulator_may_refute_it_and_does_not_make_it_more(tmp_path, gamma, ve
     assert not isinstance(run.certificate, gc.Declaration)
 
 
-def test_what_only_the_closed_loop_meets_fails_the_run(tmp_path):
+def kicked():
     """A kick at the ends of the input: no point that is drawn lies there, and inputs of the controller do."""
     kick = {**MODEL, "next": {"x": "x + 0.1*v", "v": "v + 0.1*u + 500000*max(abs(u) - 0.999999, 0)"}}
     spec = {**SPEC, "backend": kick, "sampling": {"kind": "grid", "counts": {"x": 4, "v": 4, "u": 4}}}
-    spec |= {"certificate": {"claim": "assumed", "violation": 1e-2}, "closed_loop": {"starts": 10, "steps": 30}}
-    run = gc.run(spec, out=tmp_path)
+    return spec | {"certificate": {"claim": "assumed", "violation": 1e-2}, "closed_loop": {"starts": 10, "steps": 30}}
+
+
+def test_the_text_of_a_backend_is_searched_for_what_exceeds_a_declared_gap(tmp_path):
+    said = r"gap: γ: \|f̂ − f\| of v is 0.0\d+ at \(x, u\) = .*, and the declaration allows 0.02;"
+    with pytest.raises(gc.UsageError, match=said):
+        gc.run(kicked(), out=tmp_path)
+
+
+def test_what_only_the_closed_loop_meets_fails_the_run(tmp_path, monkeypatch):
+    """As where the backend is an engine, and has no text."""
+    monkeypatch.setattr(contradiction, "hunt", lambda *asked: False)
+    run = gc.run(kicked(), out=tmp_path)
     assert run.summary["certificate"]["audit"]["violations"] == 0
     assert (run.summary["verdict"], run.exit_code) == ("fails", 1)
     assert run.summary["reason"].startswith("closed loop with γ: ")

@@ -263,6 +263,17 @@ def test_audits_of_one_question_are_counted_over_all_plans(certify, tmp_path):
     assert numbers == [1, 2]
 
 
+def test_attacks_from_other_hidden_states_are_counted_and_draw_afresh(certify, tmp_path):
+    made = [
+        certify(HiddenPlan("default"), seed=seed, folder=tmp_path / str(i), ledger=tmp_path / "book.json")
+        for i, seed in enumerate((0, 0, 1))
+    ]
+    attacks = [c.gate.attack for c in made]
+    assert [(a["number"], a["book"]["kind"]) for a in attacks] == [(k, "hidden state") for k in (1, 1, 2)]
+    assert attacks[0] == attacks[1]
+    assert attacks[0]["witness"] != attacks[2]["witness"]
+
+
 def test_another_law_is_another_audit_even_of_the_same_function(certify, tmp_path):
     laws = ({"v": (-1.0, 1.0)}, {"v": (-1.0, 1.0), "wear": (0.0, 1.0)})
     made = [

@@ -14,8 +14,6 @@ from pathlib import Path
 import pytest
 
 import gapcert as gc
-from gapcert.cli.cleaning import remove, seconds, size
-from gapcert.cli.listing import entry, sized
 from gapcert.cli.main import main
 from gapcert.cli.terminal import Terminal
 from gapcert.cli.watching import Follower
@@ -26,7 +24,9 @@ from gapcert.run.folder import alive, enter, myself, owned, owner, spec_of
 from gapcert.run.journal import Journal
 from gapcert.run.progress_rate import Pace, counted, duration, speed
 from gapcert.run.status import RunFolder, standing
-from gapcert_compare.run_folders import Figure, change, compare
+from gapcert_runs.cleaning import remove, seconds, size
+from gapcert_runs.comparison import Figure, change, compare
+from gapcert_runs.listing import entry, sized
 
 
 @pytest.fixture

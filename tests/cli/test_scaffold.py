@@ -15,8 +15,8 @@ import pytest
 
 import gapcert.testing
 from gapcert.cli.main import main
-from gapcert.cli.scaffold.scaffold import OFFERED, scaffold
 from gapcert.contracts.plugins.component import KINDS
+from gapcert_scaffold.scaffold import OFFERED, scaffold
 
 ROOT = Path(__file__).parents[2]
 SHORT, LONG = "ab", "a-name-as-long-as-one-may-have"

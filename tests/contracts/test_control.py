@@ -77,6 +77,23 @@ def test_losing_cells_are_outside() -> None:
         c.act(x, "last")
 
 
+def test_rows_outside_are_nan_on_request_and_no_other_row_changes() -> None:
+    """A random input is that of its row, whoever else is outside."""
+    c, rng = controller(), np.random.default_rng(4)
+    x = rng.uniform(-0.3, 1.3, (200, 2))
+    x[7] = np.nan
+    inside = c.contains(x)
+    assert 0 < inside.sum() < 200
+    for policy in ("first", "random"):
+        u = c.act(x, policy, seed=5, k=3, outside="nan")
+        assert np.isnan(u[~inside]).all()
+        assert np.array_equal(u[inside], c.act(np.where(inside[:, None], x, 0.05), policy, seed=5, k=3)[inside])
+    assert np.isnan(c.act(np.full((3, 2), 7.0), "first", outside="nan")).all()
+    for state, told in (((0.1, 1.4), r"\(y = 1.4 is outside \[0, 1\] m\)"), ((0.1, 0.5), r"take outside='nan'$|`act`$")):
+        with pytest.raises(UsageError, match=told):
+            c.act(np.array([state]), "first")
+
+
 def test_policies_take_allowed_inputs() -> None:
     c = controller()
     x = np.array([[0.05, (j + 0.5) / 11] for j in range(11) if j != 5])

@@ -26,5 +26,14 @@ def test_what_another_answer_is():
         assert found.startswith(f"/{key}")
 
 
+def test_where_another_function_was_audited_words_count():
+    before = {"verdict": "holds", "states": {"q": {"gap": 1.0}}, "audit": {"violations": 0, "book": {"audited": "a"}}}
+    after = {**before, "states": {"q": {"gap": 1.01}}, "audit": {"violations": 1, "book": {"audited": "b"}}}
+    assert not list(golden.differences(before, after, 1e-6))
+    assert list(golden.differences(before, {**after, "verdict": "fails"}, 1e-6))
+    assert list(golden.differences(before, {**after, "states": {}}, 1e-6))
+    assert len(list(golden.differences(before, {**after, "audit": before["audit"]}, 1e-6))) == 1
+
+
 def test_all_that_is_asked_is_stored():
     assert set(STORED) == set(golden.SHORT)

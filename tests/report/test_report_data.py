@@ -12,12 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import gapcert as gc
-from gapcert_figures.data import Figures
+from gapcert_figures.data import Axis, Band, Figures, GapFigure
 from gapcert_report.pages.page import write_report
 from gapcert_report.pictures.album import album_of
 from gapcert_report.pictures.gap import band_pictures, slice_pictures
 from gapcert_report.pictures.svg import draw, heat, packed
-from gapcert_report.words.words import tightness_sentence
+from gapcert_report.words.words import claim_sentence, tightness_sentence
 
 DATA = re.compile(r'<script type="application/json">(.*?)</script>', re.S)
 
@@ -80,6 +80,39 @@ def test_a_band_is_read_off_as_it_is(small_run):
     assert sorted(p["y"][0] * unit for p in arrays(named["constant bound"])) == pytest.approx(
         [-b.constant, b.constant], rel=1e-5
     )
+
+
+@pytest.mark.parametrize("refuted", [False, True])
+def test_a_refuted_band_is_hatched_and_an_empty_one_is_called_that(refuted):
+    at = np.linspace(-2.0, 5.0, 301)
+    low, high = 0.3 * np.sin(at) - 0.2, 0.3 * np.sin(at) + 0.4 - 0.25 * np.abs(at)
+    band = Band("v", "m/s", Axis("a", "1", -2.0, 5.0), at, 0 * at, low, high, np.full(301, 0.9), 1.2)
+    picture = band_pictures(GapFigure((band.axis,), "", (), (band,), np.zeros((0, 1))), refuted)[0][0]
+    series = {s["name"]: arrays(s) for s in picture.data["series"]}
+    mark = ", refuted" if refuted else ""
+    assert set(series) == {f"±γ{mark}", f"[l, u]{mark}", "no band: l above u", "f̂ − f", "constant bound"}
+    assert [("var(--with)" in e.swatch) for e in picture.legend] == [not refuted, not refuted, False, False, False]
+    # What is filled has l below u, and what is empty is hatched, in no face colour, where they have crossed.
+    for part in series[f"[l, u]{mark}"]:
+        assert (np.interp(part["x"], at, high - low) >= -0.02).all()
+    for part in series["no band: l above u"]:
+        assert (np.interp(part["x"], at, low - high) >= -0.02).all()
+    assert ("fill: var(--with)" in picture.svg) == (not refuted)
+    assert picture.svg.count("<pattern") == (2 if refuted else 1)
+    assert ("its refuted band" in picture.caption, "certified" in picture.caption) == (refuted, not refuted)
+    assert "no value is left in it" in picture.caption
+
+
+def test_pictures_and_words_of_a_refuted_certificate_agree(small_run):
+    figures, audit = Figures.load(small_run.folder), small_run.summary["certificate"]["audit"]
+    broken = small_run.summary | {"certificate": small_run.summary["certificate"] | {"audit": audit | {"violations": 3}}}
+    for summary, refuted in ((small_run.summary, False), (broken, True)):
+        made = album_of(figures, summary)
+        pictures = (*made.hero, *made.pairs, *made.bands, *made.other_axes)
+        gap = [p for p in pictures if p.title.startswith(("Gap of", "Certified", "Refuted"))]
+        assert len(gap) >= 4
+        assert all(("refuted" in (p.title + p.caption).lower()) == refuted for p in gap)
+        assert claim_sentence(summary["certificate"]).startswith("Refuted") == refuted
 
 
 def test_a_map_is_read_off_as_it_is(small_run):

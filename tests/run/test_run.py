@@ -10,6 +10,7 @@ import pytest
 
 import gapcert as gc
 import gapcert_cells
+from gapcert.certification import contradiction
 from gapcert.cli.main import main
 from gapcert.contracts.controllers.policies import POLICIES
 from gapcert_figures.data import Figures
@@ -89,7 +90,8 @@ def test_the_runs_are_an_audit_that_no_step_refutes(run):
     loop = run.summary["closed_loop"]
     claim = {k: loop["claim"][k] for k in ("kind", "beta", "runs", "violations")}
     assert claim == {"kind": "statistical", "beta": 0.001, "runs": 20, "violations": 0}
-    assert 1 - 0.001 ** (1 / 20) <= loop["claim"]["epsilon"] < 1 - 0.001 ** (1 / 20) + 2e-4
+    least = 1 - (0.001 / 2) ** (1 / 20)  # the first audit of a question spends half of its β
+    assert least <= loop["claim"]["epsilon"] < least + 2e-4
     for row in loop["policies"]:
         if row["controller"] == "with_gamma":
             assert (row["broken_promises"], row["outside_gap"], row["steps_held"]) == (0, 0, 2000)
@@ -206,7 +208,8 @@ def test_a_model_without_ranges_is_refused_before_a_sample_is_drawn(tmp_path, mo
     assert not list(tmp_path.rglob("chunk-*"))
 
 
-def test_a_refuted_claim_fails_with_a_witness(tmp_path):
+def test_a_refuted_claim_fails_with_a_witness(tmp_path, monkeypatch):
+    monkeypatch.setattr(contradiction, "hunt", lambda *asked: False)  # as of an engine, whose equations nobody has
     low = {"x": dict.fromkeys("xva", 1e-9), "v": dict.fromkeys("xva", 1e-9)}
     run = gc.run(
         BOUND_ONLY

@@ -13,6 +13,7 @@ import gapcert as gc
 from gapcert.certification.routes import Request
 from gapcert.certification.samples.executors import threads
 from gapcert.contracts.gaps.predictor import Samples
+from gapcert.testing.toys import Opaque
 from gapcert_bounds.constants.declared_constants import Declared
 from gapcert_bounds.families.envelope import Envelope
 from gapcert_bounds.testing.fields import Field, Kink, Nothing, Waves, gap_problem
@@ -111,7 +112,9 @@ def test_an_audit_after_one_that_failed_has_half_of_its_risk(tmp_path: Path) -> 
             "executor": threads,
             "predictor": "none",
         }
-        return gc.certify(Nothing(field), field, field.domain, lipschitz=Declared(values), folder=tmp_path / name, **options)
+        return gc.certify(
+            Nothing(field), Opaque(field), field.domain, lipschitz=Declared(values), folder=tmp_path / name, **options
+        )
 
     first, second = made("small", 0.2), made("true", 1.0)
     assert first.audit.violations > 0

@@ -11,8 +11,8 @@ import pytest
 from yaml_server import Server
 
 from gapcert.cli.main import main
-from gapcert.cli.scaffold.scaffold import scaffold
 from gapcert.spec import editor
+from gapcert_scaffold.scaffold import scaffold
 
 ROOT = Path(__file__).parents[2]
 SPECS = sorted((ROOT / "specs").rglob("*.yaml"))

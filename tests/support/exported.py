@@ -38,7 +38,9 @@ int main(void) {
 
 
 def states(c: GridController, n: int = 100_000) -> np.ndarray:
-    """Uniform beyond the grid; a third of all numbers on cell edges or next to them, some turned, some odd."""
+    """Uniform beyond the grid; a third of all numbers on cell edges or next to them, some turned, some odd; a tenth of the
+    angles within 400 floats of where the box begins and ends, twenty turns away at most.
+    """
     rng = np.random.default_rng(1)
     low, high = np.array(c.goal.stay.low), np.array(c.goal.stay.high)
     x = low - 0.1 * (high - low) + 1.2 * (high - low) * rng.random((n, 3))
@@ -49,6 +51,9 @@ def states(c: GridController, n: int = 100_000) -> np.ndarray:
         x[on, j] = at[on]
     turn = rng.random(n) < 0.5
     x[turn, 1] += 2 * np.pi * rng.integers(-3, 4, n)[turn]
+    seam = rng.random(n) < 0.1
+    end = rng.choice([low[1], high[1]], n) + 2 * np.pi * rng.integers(-20, 21, n)
+    x[seam, 1] = (end.view(np.int64) + rng.integers(-400, 401, n)).view(np.float64)[seam]
     odd = rng.random(n) < 0.01
     x[odd, rng.integers(3)] = rng.choice(ODD, odd.sum())
     return x

@@ -303,6 +303,73 @@ def test_a_smaller_gap_and_more_cells_are_named_where_only_both_help() -> None:
     assert winning(None, 20) == winning(Band(low, high), cells["theta"]) == 0
 
 
+def cart(pull: float) -> Model:
+    """Pulled back by `pull` per metre."""
+    return load_spec(CART | {"model": {**CART["model"], "parameters": {"tau": "0.25 s", "pull": f"{pull} Hz^2"}}}).build(
+        "model"
+    )
+
+
+def weak(pull: float, low: float, high: float, goal: Goal | None = None, gap: Any = None, cells: int = 24) -> dict[str, Any]:
+    """What is told of a cart that can push by low to high, in m/s^2, from 0.4 to 2.4 m."""
+    model = cart(pull)
+    domain = Domain.of(model, {"x": (0.4, 2.4), "v": (-1.0, 1.0), "a": (low, high)})
+    problem = SynthesisProblem(model, gap, domain, goal or Goal("invariance", domain.states))
+    return dict(Symbolic({"x": cells, "v": cells}, {"a": 21}).synthesize(problem).evidence)
+
+
+CART: dict[str, Any] = {
+    "version": 1,
+    "name": "cart",
+    "model": {
+        "kind": "equations",
+        "states": {"x": "m", "v": "m/s"},
+        "inputs": {"a": "m/s^2"},
+        "next": {"x": "x + tau*v", "v": "v + tau*(a - pull*x)"},
+        "period": "0.25 s",
+    },
+}
+
+
+def test_inputs_that_are_too_weak_come_first_with_what_is_needed_and_what_suffices() -> None:
+    """pull · 0.4 m is the least that holds the cart anywhere; the range that is named wins, and one below that does not."""
+    small, large = Band((-1e-4, -1e-3), (1e-4, 1e-3)), Band((-1e-4, -0.3), (1e-4, 0.3))
+    for gap in (None, small, large):
+        told = weak(2.5, -0.4, 0.4, gap=gap)
+        assert told["winning_cells"] == 0
+        assert told["reason"].startswith("v: the inputs are too weak: with a in [-0.4, 0.4] m/s^2 each step moves v by -")
+        assert "for γ = 0 too" in told["reason"]
+        low, high = told["change"]["inputs"]["a"]
+        assert low == -0.4
+        needed = "about a in [-0.4, 1] m/s^2 is needed at the least"
+        assert f"{needed}; for γ = 0, a in [-0.4, {high:.3g}] m/s^2 suffices" in told["reason"]
+        assert weak(2.5, -0.4, high)["winning_cells"] > 0
+        assert weak(2.5, -0.4, 0.99)["winning_cells"] == 0
+    assert "reason" not in weak(2.5, -0.4, 5.0)
+
+
+def test_a_goal_that_no_input_keeps_is_to_blame_itself() -> None:
+    axes = cart(1.0).states
+    moving = Goal("invariance", Box(axes, (0.4, 0.3), (2.4, 0.9)))
+    told = weak(1.0, -5.0, 5.0, moving, Band((-1e-4, -1e-3), (1e-4, 1e-3)))
+    assert told["reason"].startswith(
+        "x: each step moves x by 0.075 to 0.225 m wherever the goal has it stay, for γ = 0 too, even"
+    )
+    assert told["reason"].endswith("so the goal cannot be kept; choose another goal")
+    assert told["change"] == {}
+
+
+def test_a_target_behind_a_wall_is_told_after_all_else_was_tried() -> None:
+    axes = cart(1.0).states
+    stay = Box(axes, (0.4, -1.0), (2.4, 1.0))
+    far, wall = (Region((Box(axes, low, high),)) for low, high in (((2.1, -1.0), (2.4, 1.0)), ((1.4, -1.0), (2.1, 1.0))))
+    told = weak(1.0, -0.3, 0.3, Goal("reach_avoid", stay, far, wall), Band((-1e-4, -1e-3), (1e-4, 1e-3)), cells=20)
+    assert told["reason"].startswith("nothing beyond the target: ")
+    assert "for γ = 0 nothing wins either, with these cells and inputs" in told["reason"]
+    assert told["reason"].endswith("; neither do more cells help, nor inputs 33 times as wide")
+    assert "inputs" not in told["change"]
+
+
 def test_nothing_beyond_the_target_is_no_answer() -> None:
     """A target that is won where it stands, and that no step leads into."""
     whole = rod_reach_avoid().stay

@@ -11,11 +11,12 @@ import pytest
 
 from gapcert import Interval, Model, Region, SynthesisProblem, UsageError, run
 from gapcert.cli.main import main
+from gapcert_cells import GROWTH, SEEN
 from gapcert_cells.testing import Rod, rod_problem
 from gapcert_symbolic.cells.abstraction import windows
 from gapcert_symbolic.cells.bounds import Enclosed, Grown, structure
 from gapcert_symbolic.cells.grid import Grid, multiples
-from gapcert_symbolic.synthesizer import SEEN, TRUSTED, Symbolic
+from gapcert_symbolic.synthesizer import Symbolic
 
 
 class Radii(Rod):
@@ -89,7 +90,7 @@ def test_growth_bounds_contain_what_intervals_do_not_exceed_by_much() -> None:
 def test_a_controller_on_trust_says_so() -> None:
     made = Symbolic(align="scots", eta=ETA, growth=Radii()).synthesize(problem())
     assert made.evidence["winning_cells"] > 0
-    assert made.evidence["assumptions"] == [TRUSTED]
+    assert made.evidence["assumptions"] == [GROWTH]
     assert "assumptions" not in Symbolic({"theta": 20, "omega": 20}, {"torque": 5}).synthesize(problem()).evidence
 
 
@@ -125,7 +126,7 @@ def test_an_opaque_model_has_the_same_controller() -> None:
     )
     assert known.evidence["winning_cells"] > 0
     assert np.array_equal(known.bits, opaque.bits)
-    assert (known.evidence["assumptions"], opaque.evidence["assumptions"]) == ([TRUSTED], [TRUSTED, SEEN])
+    assert (known.evidence["assumptions"], opaque.evidence["assumptions"]) == ([GROWTH], [GROWTH, SEEN])
     view = windows(
         Grown(Opaque(), Radii(), np.full(2, 1e-12)), Grid(problem().goal.stay, (9, 8)), (np.linspace(-1, 1, 3),), None
     )
@@ -189,7 +190,7 @@ def test_a_spec_names_the_model_of_radii(tmp_path: Path, capsys: pytest.CaptureF
     code = main(["run", str(tmp_path / "spec.yaml"), "--out", str(tmp_path / "out"), "--json"])
     out = capsys.readouterr().out
     assert code == 0, out
-    assert TRUSTED in out
+    assert GROWTH in out
 
 
 def test_cells_that_stick_out_are_not_safe() -> None:

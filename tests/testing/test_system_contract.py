@@ -110,6 +110,21 @@ class Remembers(Faulty):
         return Step(out.x + (0.0 if last in (None, self.last) else 1e-15), out.hidden)
 
 
+class Sleeps(Faulty):
+    """Whatever is close to the row before it, and is not that, hardly moves."""
+
+    def _step(self, x, u, **options):
+        out = super()._step(x, u, **options)
+        away = np.abs(np.diff(x, axis=0, prepend=x[:1] + 1)).max(axis=1, keepdims=True)
+        return Step(out.x + 1e-13 * ((away > 0) & (away < 1e-3)), out.hidden)
+
+
+class Sulks(Faulty):
+    def _step(self, x, u, **options):
+        out, self.far = super()._step(x, u, **options), getattr(self, "far", False) or bool((np.abs(x) > 100).any())
+        return Step(out.x + 1e-13 * self.far, out.hidden)
+
+
 class WarmStart(Faulty):
     def _step(self, x, u, **options):
         out = super()._step(x, u, **options)
@@ -122,6 +137,34 @@ class SumsBatch(Faulty):
     def _step(self, x, u, **options):
         out = super()._step(x, u, **options)
         return Step(out.x + 1e-9 * len(x), out.hidden)
+
+
+class StopsEarly(Faulty):
+    """A solver that starts from the last row's solution, and has nothing left to do where that is close."""
+
+    def _step(self, x, u, **options):
+        out = super()._step(x, u, **options)
+        close = np.abs(np.diff(x, axis=0, prepend=x[:1] + 1)).max(axis=1) < 1e-3
+        return Step(out.x + 1e-9 * close[:, None], out.hidden)
+
+
+class Dirty(Faulty):
+    """What failed leaves its half-made state behind."""
+
+    def _step(self, x, u, **options):
+        out = super()._step(x, u, **options)
+        if np.abs(u).max() > 100:
+            self.calls = 1
+            raise ArithmeticError("no convergence")
+        return Step(out.x + 1e-9 * self.calls, out.hidden)
+
+
+class LongRollout(Faulty):
+    """Right for a while: its buffer holds 32 steps."""
+
+    def _rollout(self, x0, u_sequence, **options):
+        out = super()._rollout(x0, u_sequence, **options)
+        return Step(out.x + 1e-12 * (np.arange(out.x.shape[1]) > 32)[None, :, None], out.hidden)
 
 
 class Draws(Faulty):
@@ -262,6 +305,10 @@ FAULTS = [
     (Remembers, "test_repeats_bit_for_bit"),
     (WarmStart, "test_order_does_not_matter"),
     (SumsBatch, "test_batch_equals_singles"),
+    (Sleeps, "test_company_does_not_matter"),
+    (Sulks, "test_failures_leave_no_trace"),
+    (StopsEarly, "test_company_does_not_matter"),
+    (Dirty, "test_failures_leave_no_trace"),
     (Draws, "test_fresh_instance_gives_the_same_bits"),
     (elsewhere, "test_another_process_gives_the_same_bits"),
     (EmptyFails, "test_empty_batch"),
@@ -270,6 +317,7 @@ FAULTS = [
     (Forgets, "test_pickles"),
     (DigestOfCache, "test_digest_names_the_physics"),
     (FastRollout, "test_rollout_equals_steps"),
+    (LongRollout, "test_rollout_equals_steps"),
     (DropsHiddenInRollout, "test_rollout_equals_steps"),
     (TakesAnything, "test_undeclared_options_are_refused"),
     (NoInput, "test_input_matters"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
@@ -14,62 +14,20 @@ import numpy as np
 
 import gapcert
 from gapcert.certification.gates.hidden_state import Gate
+from gapcert.certification.ledger import Entry
 from gapcert.certification.refutation import warnings
 from gapcert.contracts.gaps.claim import Claim
 from gapcert.contracts.gaps.gap import GapFunction, GapProblem
 from gapcert.contracts.gaps.lipschitz import LipschitzBound
 from gapcert.contracts.gaps.predictor import Samples
 from gapcert.contracts.plugins.presentation import Shown
-from gapcert.contracts.systems.domain import Domain
+from gapcert.contracts.systems.domain import Domain, Outside
 from gapcert.contracts.systems.system import Model, difference
 from gapcert.numerics.arrays import Array, Bools
 from gapcert.numerics.atomic_files import npz_bytes, write_atomic
-from gapcert.numerics.errors import UsageError
 
 if TYPE_CHECKING:
     from gapcert.contracts.data.recording import Recording
-
-
-@final
-@dataclass(frozen=True)
-class Ledger:
-    """The audits of each question (model, backend, domain), in one JSON file beside the run folders.
-
-    Audit k = 1, 2, … of a question may spend β_k = β / 2^k, so that all together spend at most β. The same audited object
-    again is the same audit. An entry is written before the audit's points are drawn: an audit that was begun counts.
-    """
-
-    path: Path
-
-    def enter(self, question: str, audited: str) -> int:
-        """k of this audit; a new one is recorded under an exclusive lock."""
-        import fcntl
-
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        # Opened as it is: a lock has no content to be truncated, wherever a link may lead.
-        with open(self.path.with_suffix(".lock"), "a") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            book = self._book()
-            audits = book.setdefault(question, [])
-            if audited not in audits:
-                audits.append(audited)
-                write_atomic(self.path, json.dumps(book, indent=1).encode())
-            return audits.index(audited) + 1
-
-    def _book(self) -> dict[str, list[str]]:
-        """The audits of each question. A ledger that cannot be read is never begun anew: that would spend β twice."""
-        if not self.path.exists():
-            return {}
-        try:
-            book: dict[str, list[str]] = json.loads(self.path.read_text(encoding="utf-8"))
-            if not all(isinstance(a, str) for audits in book.values() for a in audits):
-                raise ValueError("it holds something else")
-        except (OSError, ValueError, AttributeError, TypeError, RecursionError) as error:
-            raise UsageError(
-                f"{self.path}: the ledger of audits cannot be read ({error}); expected the JSON that runs write; restore it, "
-                "or, if the count of audits may be lost, move it away, and run it again"
-            ) from None
-        return book
 
 
 @final
@@ -79,12 +37,17 @@ class Audit:
 
     z: Array
     r: Array
-    k: int
+    entry: Entry
     epsilon: float
     beta: float
     outside: Bools
     above: Bools
     limit: int = 0
+
+    @property
+    def k(self) -> int:
+        """Its number among those of the question, by which it spends β_k."""
+        return self.entry.k
 
     @property
     def violations(self) -> int:
@@ -191,8 +154,12 @@ def overpowered(gamma: Array, model: Model, domain: Domain, z: Array) -> list[fl
 class Record(ABC):
     """How a route came to its band, where that is no function of samples and constants alone: further points, say."""
 
-    k: int
-    """Number of the audit of this question, whose β it has spent."""
+    entry: Entry
+    """Where the book counts it: it has spent β_k of its number k."""
+
+    @property
+    def k(self) -> int:
+        return self.entry.k
 
     @property
     @abstractmethod
@@ -220,8 +187,49 @@ class Record(ABC):
         """What `gapcert verify` needs besides the samples, named as in `certificate.npz`."""
 
 
-class Statement(Shown, ABC):
-    """What a certificate or a person says of γ: it is asked, held against measurements, and saved."""
+Band = Callable[[Array], tuple[Array, Array]]
+"""(l, u) at points z (n, nz), each (n, nx)."""
+
+
+class Statement(ABC):
+    """What is said of γ on a set Z, by a certificate, a person, or either as it was stored: asked there, and held against
+    measurements. Points are in the coordinates of Z: where a spec has `coordinates:`, u are these.
+    """
+
+    @abstractmethod
+    def _about(self) -> tuple[Domain, Band]:
+        """Z, and (l, u) at points of it."""
+
+    def interval(self, x: Array, u: Array, *, outside: Outside = "raise") -> tuple[Array, Array]:
+        """(l, u) with l ≤ f̂ − f ≤ u: x (n, nx) or (nx,), u (n, nu) or (nu,) → (n, nx) each.
+
+        Where (x, u) is not in Z, nothing is known: UsageError that names the axis and its value, or with `outside="nan"` a row
+        of NaN.
+        """
+        z = np.concatenate([np.atleast_2d(np.asarray(v, dtype=float)) for v in (x, u)], axis=1)
+        domain, band = self._about()
+        inside = domain.asked(z, outside)
+        both = np.full((2, len(z), domain.nx), np.nan)
+        if inside.any():
+            both[:, inside] = band(z[inside])
+        return both[0], both[1]
+
+    def gamma(self, x: Array, u: Array, *, outside: Outside = "raise") -> Array:
+        """γ(x, u) = max(|l|, |u|), (n, nx); x, u and outside as for `interval`."""
+        low, high = self.interval(x, u, outside=outside)
+        return np.asarray(np.maximum(np.abs(low), np.abs(high)))
+
+    def check(self, recording: Recording, noise: Mapping[str, float] | None = None) -> Any:
+        """New measurements against γ, as a `Check`; noise: by how much channels may err, in the model's units."""
+        return gapcert.check(gapcert.Certified.of(self), recording, noise)
+
+    def monitor(self) -> Any:
+        """γ watched online, one transition at a time: a `Monitor`."""
+        return gapcert.Monitor(gapcert.Certified.of(self))
+
+
+class SavedStatement(Statement, Shown):
+    """One that holds its gap function: it is shown, and saved."""
 
     gap: GapFunction
     versions: Mapping[str, str]
@@ -230,39 +238,26 @@ class Statement(Shown, ABC):
     def summary(self) -> dict[str, Any]:
         """The `certificate` object of the JSON contract."""
 
-    def gamma(self, x: Array, u: Array) -> Array:
-        """γ(x, u): x (n, nx) or (nx,), u (n, nu) or (nu,) → (n, nx)."""
-        z = np.concatenate([np.atleast_2d(np.asarray(x, dtype=float)), np.atleast_2d(np.asarray(u, dtype=float))], axis=1)
-        return self.gap.gamma(z)
-
-    # `Certified.of` takes a Certificate or a Declaration, and types know no class that has no other subclasses: hence Any.
-    def check(self: Any, recording: Recording, noise: Mapping[str, float] | None = None) -> Any:
-        """New measurements against γ, as a `Check`; noise: by how much channels may err, in the model's units."""
-        return gapcert.check(gapcert.Certified.of(self), recording, noise)
-
-    def monitor(self: Any) -> Any:
-        """γ watched online, one transition at a time: a `Monitor`."""
-        return gapcert.Monitor(gapcert.Certified.of(self))
-
-    def _write(self, folder: Path, domain: Domain, predictor: str, arrays: Mapping[str, Array], **more: Any) -> None:
+    def _write(self, folder: Path, predictor: str, arrays: Mapping[str, Array], **more: Any) -> None:
         """`certificate.json`, the summary and `more`, and `certificate.npz`, γ's own arrays and others."""
         content = npz_bytes({**{f"gap.{k}": v for k, v in self.gap.arrays().items()}, **arrays})
         data = {
             **self.summary(),
             "form": dict(self.gap.form),
             "predictor": predictor,
-            "domain": domain_data(domain),
+            "domain": domain_data(self._about()[0]),
             "arrays": hashlib.sha256(content).hexdigest(),
             "versions": dict(self.versions),
             **more,
         }
+        folder.mkdir(parents=True, exist_ok=True)
         write_atomic(folder / "certificate.npz", content)
         write_atomic(folder / "certificate.json", json.dumps(data, indent=1, sort_keys=True).encode())
 
 
 @final
 @dataclass(frozen=True, repr=False)
-class Certificate(Statement):
+class Certificate(SavedStatement):
     """γ with l ≤ r ≤ u, what that rests on, and the evidence."""
 
     gap: GapFunction
@@ -281,6 +276,9 @@ class Certificate(Statement):
     @property
     def domain(self) -> Domain:
         return self.problem.domain
+
+    def _about(self) -> tuple[Domain, Band]:
+        return self.domain, self.gap.interval
 
     @property
     def samples(self) -> Samples:
@@ -326,7 +324,7 @@ class Certificate(Statement):
                 "gamma_violations": int(a.above.sum()),
                 "epsilon": a.epsilon,
                 "beta": a.beta,
-                "number": a.k,
+                **a.entry.summary(),
             },
             "vacuous": self.vacuous,
             "lipschitz": self.lipschitz.summary(self.domain.axes),
@@ -341,7 +339,11 @@ class Certificate(Statement):
             out["attack"] = dict(self.attack)
         if (witness := a.witness(self.gap)) is not None:
             out["audit"]["witness"] = witness | {"at": {a.name: v for a, v in zip(self.domain.axes, witness["z"], strict=True)}}
-        said = [*(self.gate.warnings if self.gate is not None else ()), *warnings(self.lipschitz, self.domain.axes)]
+        said = [
+            *(self.gate.warnings if self.gate is not None else ()),
+            *warnings(self.lipschitz, self.domain.axes),
+            *a.entry.warnings,
+        ]
         hidden = self.gate.summary() if self.gate is not None else None
         out |= {k: v for k, v in (("hidden", hidden), ("warnings", said)) if v}
         return out
@@ -352,7 +354,7 @@ class Certificate(Statement):
         arrays = {f"predictor.{k}": v for k, v in p.predictor.arrays().items()}
         arrays |= {"lipschitz": p.lipschitz.value, "resolution": p.resolution, "remainder.resolution": p.remainder_resolution}
         arrays |= {} if p.lipschitz.cells is None else p.lipschitz.cells.arrays()
-        arrays |= {} if p.rounding is None else {"rounding": p.rounding}
+        arrays |= {} if p.arithmetics is None else {"rounding": p.arithmetic}
         arrays |= {} if p.lipschitz.curvature is None else {"curvature": p.lipschitz.curvature}
         for j, slab in enumerate(p.lipschitz.slabs or ()):
             arrays |= {} if slab is None else {f"curvature.cuts{j}": slab[0], f"curvature.slabs{j}": slab[1]}
@@ -362,13 +364,13 @@ class Certificate(Statement):
             arrays["predictor.samples"] = p.predictor(p.samples.z)
         self._write(
             folder,
-            p.domain,
             p.predictor.kind,
             arrays,
             symmetry=None if p.symmetry is None else p.symmetry.to_data(),
             cover=list(p.samples.cover.counts) if p.samples.cover else None,
             seed=p.seed,
             digests=dict(self.digests),
+            arithmetic=None if p.arithmetics is None else [a.to_data() for a in p.arithmetics],
         )
 
 

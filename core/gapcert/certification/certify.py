@@ -11,16 +11,24 @@ import platform
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, final
 
 import numpy as np
+from numpy.random import Generator
 
-from gapcert.certification.certificate import Audit, Certificate, Ledger, Record, figures, gap_digest, points_refute
+from gapcert.certification import contradiction
+from gapcert.certification.certificate import Audit, Certificate, Record, figures, gap_digest, points_refute
 from gapcert.certification.compatibility import refuse, unpaired
+from gapcert.certification.fingerprint import Fingerprint, digest
 from gapcert.certification.gates import entry, hidden_state
+from gapcert.certification.gates.again import again
 from gapcert.certification.gates.augment import widen
+from gapcert.certification.gates.circle import repeating
 from gapcert.certification.gates.hidden_state import Gate, HiddenPlan
+from gapcert.certification.gates.purity import unchanged
+from gapcert.certification.ledger import Ledger
 from gapcert.certification.refutation import watched
 from gapcert.certification.routes import Findings, Request, Route
 from gapcert.certification.samples.designs import AdaptiveSampling, GridSampling, LatticeSampling, Sampling, axes_of, refined
@@ -33,10 +41,10 @@ from gapcert.contracts.gaps.lipschitz import LipschitzEstimator, LipschitzProble
 from gapcert.contracts.gaps.predictor import AffinePredictor, ModelPredictor, Predictor, Samples
 from gapcert.contracts.plugins.events import Emit, Event, Pulse, silent
 from gapcert.contracts.plugins.registry import registry
+from gapcert.contracts.systems.arithmetic import named
 from gapcert.contracts.systems.domain import Domain, Points
 from gapcert.contracts.systems.system import Model, System
 from gapcert.numerics.arrays import Array, Bools
-from gapcert.numerics.digest import json_digest
 from gapcert.numerics.errors import UsageError
 from gapcert.version import __version__
 
@@ -57,7 +65,7 @@ def certify(
     seed: int = 0,
     folder: Path | str = "runs/certify",
     ledger: Path | str | None = None,
-    question: str | None = None,
+    question: Fingerprint | None = None,
     executor: Callable[[], Executor] = processes,
     emit: Emit = silent,
 ) -> Certificate:
@@ -69,8 +77,8 @@ def certify(
     `predictor` overrides the family's; a Model there is an extended model. `hidden`: what is done where hidden state matters
     (default: refuse); hidden states that the domain names become states. `symmetries`: axes along which the residual is
     declared not to change; that is checked on pairs before it saves samples. Samples live in `folder`, the audit ledger in the
-    file `ledger` (default: beside the folder), under the digest `question` (default: that of model, backend and domain).
-    UsageError where the ingredients cannot give the claim.
+    file `ledger` (default: beside the folder), under `question` (default: that of model, backend and domain). UsageError where
+    the ingredients cannot give the claim.
     """
     known = registry()
     family = family or known.build("gap_family", "envelope")
@@ -85,22 +93,27 @@ def certify(
         p, _ = widen(p, backend, domain)
     entry.contain(model, domain)
     model, backend = widen(model, backend, domain)
-    question = question or digest(model, backend, domain)
-    name, backend = by.prepared(request, family, backend, seed)
+    question = question or Fingerprint(model, backend, domain)
+    name, drawn = by.prepared(request, family, backend, seed)
     fit = by if name == by.name else known.build("route", name)
-    refuse(model, backend, family, lipschitz, fit, request.claim, sampling.kept(domain) is not None)
+    refuse(model, drawn, family, lipschitz, fit, request.claim, sampling.kept(domain) is not None)
     asked = Question(model, domain, sampling, lipschitz, family, p, by, fit, request, symmetries, seed, question)
 
     plan = replace(hidden or HiddenPlan(), ignore=(*(hidden or HiddenPlan()).ignore, *symmetries))
-    gate = entry.enter(model, backend, domain, plan, request.claim, executor, seed, emit)  # r = f̂ − f is a function of (x, u)
+    gate = entry.enter(model, drawn, domain, plan, request.claim, executor, seed, emit)  # r = f̂ − f is a function of (x, u)
+    gate = replace(gate, turns=repeating(model, backend, domain, seed))  # where angles close on themselves, of the circle
     with Kept(executor) as pools:
         key = digest(model, gate.system, domain)
         store = Store(Path(folder) / "samples", Residual(gate.system, model), key, pools, sampling.chunk, emit)
         book = Ledger(Path(folder).parent / "ledger.json" if ledger is None else Path(ledger))
         problem = measure(asked, store, gate)  # r at z_1, …, z_N, and constants of g
-        gap, problem, record = fitted(asked, problem, store, book)  # l ≤ r ≤ u, so |r| ≤ γ, on Z
-        audited = audit(gap, problem, asked, store, book, record)  # attacked at points that no fit has seen
-    return conclude(asked, gap, problem, record, audited, gate, store)  # what may be said
+        strong = stricter(store, gate, domain)
+        gap, problem, record = fitted(asked, problem, strong, book)  # l ≤ r ≤ u, so |r| ≤ γ, on Z
+        audited = audit(gap, problem, asked, strong, book, record)  # attacked at points that no fit has seen
+    told = ((store.residual, problem.samples.z, problem.samples.r), (strong.residual, audited.z, audited.r))
+    gate = replace(gate, purity=f"{gate.purity}; {again(told, domain, problem.arithmetic, seed)}")
+    unchanged(drawn, gate.first, seed)
+    return conclude(asked, gap, problem, record, audited, gate, strong, book)  # what may be said
 
 
 @final
@@ -119,7 +132,7 @@ class Question:
     request: Request
     symmetries: Sequence[str]
     seed: int
-    digest: str
+    identity: Fingerprint
 
 
 def _sampling(given: Sampling | None, family: GapFamily, domain: Domain, bounded: bool) -> Sampling:
@@ -131,9 +144,11 @@ def _sampling(given: Sampling | None, family: GapFamily, domain: Domain, bounded
     return sampling
 
 
-def digest(model: Model, backend: System, domain: Domain) -> str:
-    """Identity of the question: model, backend and domain alone."""
-    return json_digest(model.digest(), backend.digest(), domain.digest_data())
+def stricter(store: Store, gate: Gate, domain: Domain) -> Store:
+    """Where points come from that no fit has seen: asked in calls of many sizes, harmless hidden state drawn."""
+    system, model = gate.audited or gate.system, store.residual.model
+    key = digest(model, system, domain) if gate.audited else store.key
+    return replace(store, residual=Residual(system, model), key=key, in_calls=True)
 
 
 def measure(question: Question, store: Store, gate: Gate) -> GapProblem:
@@ -141,8 +156,11 @@ def measure(question: Question, store: Store, gate: Gate) -> GapProblem:
     domain, sampling, seed, symmetries = question.domain, question.sampling, question.seed, question.symmetries
     residual = store.residual
     # |r(z, h) − r(z′, h′)| ≤ L |z − z′| + 2 (e + s): the spread s over hidden states acts as a further resolution.
-    rounding = residual.resolution(domain)
+    both = residual.arithmetic(domain)
+    rounding = both[0].e + both[1].e
     e = rounding + gate.bound
+    for message in named(*both, [s.name for s in residual.model.states]):
+        store.emit(Event("warning", "certificate", {"message": message}))
 
     def query(name: str, points: Array) -> Array:
         return store.collect(name, Points(points))
@@ -150,7 +168,7 @@ def measure(question: Question, store: Store, gate: Gate) -> GapProblem:
     none = AffinePredictor.none(domain.nx, len(domain.low))
     pairs = entry.paired(store, gate)
     asked = LipschitzProblem(domain, none, e, query, residual.model, residual.backend, seed, pairs, rounding)
-    symmetry = Symmetry.checked(symmetries, asked) if symmetries else None
+    symmetry = contradiction.symmetric(asked, Symmetry.checked(symmetries, asked)) if symmetries else None
     held = () if symmetry is None else symmetry.axes
     sampling = sampling.holding(held)
     samples = store.samples("bound-0", sampling.first(domain), sampling.kept(domain))
@@ -164,7 +182,7 @@ def measure(question: Question, store: Store, gate: Gate) -> GapProblem:
         further = constants.cells.points(domain, samples.r, (sampling.budget or 0) - len(samples))
     else:
         further = sampling.further(domain, samples.z, samples.r, constants.value, constants)
-    problem = GapProblem(samples, domain, constants, p, e, question.fit.name, seed, rounding=rounding, symmetry=symmetry)
+    problem = GapProblem(samples, domain, constants, p, e, question.fit.name, seed, symmetry, both)
     if further is not None:
         samples = refined(problem, further, sampling.tightness, query)
     if isinstance(sampling, LatticeSampling):
@@ -205,28 +223,29 @@ def fitted(
     store.emit(Event("stage-started", "fit", {}))
     problem = replace(problem, route=question.route.name)
     made = question.family.fit(replace(problem, route=question.fit.name))
-    gap, record = question.route.band(made, problem, question.request, store, ledger, question.digest)
+    gap, record = question.route.band(made, problem, question.request, store, ledger, question.identity)
     return gap, problem, record
 
 
 def audit(
     gap: GapFunction, problem: GapProblem, question: Question, store: Store, ledger: Ledger, record: Record | None
 ) -> Audit:
-    """Draw audit k's points from (seed, k), as many as ε and β_k = β / 2^k need; test l ≤ r ≤ u and |r| ≤ γ on them.
+    """Draw audit k's points, which no fit can know, as many as ε and β_k = β / 2^k need; test l ≤ r ≤ u and |r| ≤ γ on them.
 
-    Where the route has made a record, k is its number: that has spent β_k, and the audit can only refute.
+    Where the route has made a record, its entry is that of the audit: it has spent β_k, and the audit can only refute.
     """
     request = question.request
     # The same function about other hidden states, or drawn in other coordinates, is audited at other points or answers.
     object_ = f"{gap_digest(gap, problem)}:{store.key}:{request.epsilon!r}:{request.beta!r}"
-    k = ledger.enter(question.digest, object_) if record is None else record.k
+    entry = ledger.enter(question.identity, "audit", object_) if record is None else record.entry
+    k = entry.k
     n = audit_size(request.epsilon, request.beta / 2**k)
-    z = problem.domain.draw(n, np.random.default_rng([problem.seed, k]))
+    z = problem.domain.draw(n, entry.draws(problem.seed, "audit"))
     store.emit(Event("stage-started", "audit", {"number": k, "points": n}))
     r = store.collect(f"audit-{k}", Points(z))
     outside, above = _judged(gap, z, r, Pulse(store.emit, "audit", n, "points"))
     limit = 0 if record is None else record.allowed(n, request.epsilon)
-    return Audit(z, r, k, request.epsilon, request.beta, outside, above, limit)
+    return Audit(z, r, entry, request.epsilon, request.beta, outside, above, limit)
 
 
 def _violations(gap: GapFunction, z: Array, r: Array) -> tuple[Bools, Bools]:
@@ -248,9 +267,9 @@ def _judged(gap: GapFunction, z: Array, r: Array, pulse: Pulse) -> tuple[Bools, 
     return both[0], both[1]
 
 
-def attack(gap: GapFunction, residual: Residual, domain: Domain, n: int, seed: int, emit: Emit = silent) -> dict[str, int]:
+def attack(gap: GapFunction, residual: Residual, domain: Domain, n: int, rng: Generator, emit: Emit) -> dict[str, int]:
     """Count violations on n further uniform points, drawn block by block; nothing is stored."""
-    rng, counts, block = np.random.default_rng([seed, 0xA77AC]), {"points": 0, "violations": 0, "gamma_violations": 0}, 100_000
+    counts, block = {"points": 0, "violations": 0, "gamma_violations": 0}, 100_000
     while counts["points"] < n:
         z = domain.draw(min(block, n - counts["points"]), rng)
         outside, above = _violations(gap, z, residual(z))
@@ -270,18 +289,25 @@ def conclude(
     audited: Audit,
     gate: Gate,
     store: Store,
+    ledger: Ledger,
 ) -> Certificate:
     """Evidence and the strongest claim, of those asked for, that the evidence allows."""
     route, request, model = question.route, question.request, question.model
     refuted = route.refuted(problem, gap)
-    gate = hidden_state.attacked(gate, gap, problem, model, store.emit)
-    attacked = attack(gap, store.residual, problem.domain, request.attack, problem.seed, store.emit) if request.attack else {}
+    if refuted is None and record is None and route.constants:  # else the claim rests on points alone, or on γ as declared
+        refuted = contradiction.by_audit(problem, audited.z, audited.r)
+    moved = partial(ledger.enter, question.identity, "hidden state", f"{gap_digest(gap, problem)}:{store.key}")
+    gate = hidden_state.attacked(gate, gap, problem, model, moved, store.emit)
+    fresh = audited.entry.draws(problem.seed, "attack")
+    attacked = attack(gap, store.residual, problem.domain, request.attack, fresh, store.emit) if request.attack else {}
     if record is not None and attacked:
         attacked["allowed"] = record.allowed(request.attack, request.epsilon)
     rests = route.sentences(Findings(problem, gap, record, audited, model, gate, refuted))
     drawn = f"uniform on {problem.domain.words}{gate.distribution}{'' if record is None else record.draws}"
     constant, envelope = route.yardsticks(gap, problem, record, audited.z)
     over = refuted is not None or points_refute(audited, attacked, gate)
+    if not over and record is None:
+        contradiction.declared(problem, gap, store.residual, route.claim == "assumed")
     return Certificate(
         gap,
         problem,

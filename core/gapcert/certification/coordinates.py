@@ -69,6 +69,12 @@ class Coordinates:
             columns.append(u * (1.0 / self.scale[i]) if abs(self.scale[i]) == 1 else _divided(u, self.scale[i]))
         return Interval.concatenate(columns, axis=1)
 
+    def missed(self, z: Interval) -> Array:
+        """(n, nz): what `inputs` rounds by at points of boxes of (x, w): of nx products and sums, and a division."""
+        nx, scale = len(self.slope[0]), np.abs(self.scale)
+        size = (z.mag[:, nx:] + z.mag[:, :nx] @ np.abs(self.slope).T) / scale
+        return np.hstack([np.zeros((len(z), nx)), (nx + 3) * float(np.finfo(float).eps) * size])
+
     def over(self, z: Interval) -> Interval:
         """Boxes of (x, u) → boxes that contain (x, w), (n, nz)."""
         nx = len(self.slope[0])
@@ -173,6 +179,10 @@ class _Relative:
         """Twice that of the System itself: u is rounded once more."""
         return np.asarray(2 * self.inner.resolution(magnitude))
 
+    def repeats(self, angle: str) -> str | None:
+        moves = any(row[[s.name for s in self.states].index(angle)] for row in self.relative.slope)
+        return "the coordinates measure inputs relative to it" if moves else self.inner.repeats(angle)
+
     def digest(self) -> str:
         # The System says itself what determines its answers: caches and tiles do not.
         names = [a.name for a in self.inputs]
@@ -206,6 +216,14 @@ class RelativeModel(_Relative, Model):
 
     def jacobian_enclosure(self, z: Interval) -> Interval:
         return self.relative.chain(self.inner.jacobian_enclosure(self.relative.inputs_over(z)))
+
+    def rounding_over(self, z: Interval) -> Array | None:
+        """That of the Model over the inputs as they are computed, and what their rounding changes."""
+        exact, missed = self.relative.inputs_over(z), self.relative.missed(z)
+        near = Interval.around(exact.mid, exact.rad + missed)
+        if (own := self.inner.rounding_over(near)) is None:
+            return None
+        return np.asarray(own + (self.inner.jacobian_enclosure(near).mag @ missed[..., None])[..., 0])
 
     def output(self, x: Array, u: Array, parameters: Mapping[str, Array | float] | None = None) -> Array:
         return self.inner.output(x, self.relative.inputs(x, u), parameters)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, final
 
-from gapcert.certification.certificate import Statement
+from gapcert.certification.certificate import Band, SavedStatement
 from gapcert.certification.routes import declaration, scope
 from gapcert.contracts.gaps.claim import Claim
 from gapcert.contracts.gaps.gap import GapFunction
@@ -19,7 +19,7 @@ from gapcert.version import __version__
 
 @final
 @dataclass(frozen=True, repr=False)
-class Declaration(Statement):
+class Declaration(SavedStatement):
     """|f̂ − f| ≤ γ on Z as a person says it, of a backend that nobody asked. The claim is `assumed`, and never more."""
 
     gap: GapFunction
@@ -35,6 +35,9 @@ class Declaration(Statement):
         nobody = "No simulator was asked: nothing speaks for γ, and nothing was given the chance to refute it."
         return (declaration(self.gap, names, self.domain), nobody, scope(self.model, self.domain))
 
+    def _about(self) -> tuple[Domain, Band]:
+        return self.domain, self.gap.interval
+
     def summary(self) -> dict[str, Any]:
         """The `certificate` object of the JSON contract: without samples or an audit."""
         top = self.gap.gamma_over(self.domain.interval)[0].tolist()
@@ -49,4 +52,4 @@ class Declaration(Statement):
 
     def save(self, folder: Path | str) -> None:
         """`certificate.json` and `certificate.npz`."""
-        self._write(Path(folder), self.domain, "none", {})
+        self._write(Path(folder), "none", {})

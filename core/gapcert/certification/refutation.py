@@ -23,21 +23,25 @@ _PAIRS = 1_000_000  # that are looked at together
 ADVICE = "use lipschitz.residual: {kind: piecewise}"
 
 
-def contradiction(problem: GapProblem, most: int = 2_000, suspects: Ints | None = None) -> dict[str, Any] | None:
+def contradiction(
+    problem: GapProblem, most: int = 2_000, suspects: Ints | None = None, noise: int = 2
+) -> dict[str, Any] | None:
     """Two samples with |g_i − g′_i| > Σ_j L_ij |z_j − z′_j| + J_i + 2 e_i, which refute the constants; None if there are none.
 
     All pairs of up to `most` samples are looked at (an even selection of them where there are more), of each closed cell where
     the constants hold per cell. Both computed remainders may err by their arithmetic's part of e, which counts twice more for
-    that. Or pairs of some samples, the `suspects` (by number), with all others, as computed: what a band of 2 e cannot contain.
+    that. Or pairs of some samples, the `suspects` (by number), with all others; by default as computed: what a band of 2 e
+    cannot contain. `change` and `allowed` of the worst pair are what was found and what the constants allow.
     """
     z, r = problem.samples.z, problem.samples.r
     spread = problem.resolution - problem.arithmetic
-    noise = 4 * problem.remainder_resolution - 2 * spread if suspects is None else 2 * problem.remainder_resolution
+    noise = 4 if suspects is None else noise
+    slack = noise * problem.remainder_resolution - (noise - 2) * spread
     worst: dict[str, Any] | None = None
     for rows, constants, jumps in _parts(problem.lipschitz, z):
         pick = rows[np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(int)] if suspects is None else rows
         first = None if suspects is None else np.flatnonzero(np.isin(pick, suspects))
-        found = _worst_pair(z[pick], r[pick] - problem.predictor(z[pick]), constants, jumps + noise, first)
+        found = _worst_pair(z[pick], r[pick] - problem.predictor(z[pick]), constants, jumps + slack, first)
         if found is not None and found["excess"] > (worst["excess"] if worst else 0.0):
             worst = found
     return worst
@@ -65,6 +69,7 @@ def _worst_pair(z: Array, g: Array, constants: Array, slack: Array, first: Any =
             k, m = np.unravel_index(int(np.argmax(excess)), excess.shape)
             if excess[k, m] > (worst["excess"] if worst else 0.0):
                 worst = {"state": i, "z": z[rows[k]].tolist(), "other": z[m].tolist(), "excess": float(excess[k, m])}
+                worst |= {"change": float(abs(g[rows[k], i] - g[m, i])), "allowed": float(allowed[k, m] + slack[i])}
     return worst
 
 
@@ -315,14 +320,14 @@ def kinks(bound: LipschitzBound) -> str | None:
     )
 
 
-def jump_sentence(bound: LipschitzBound, axes: Sequence[StateSpec]) -> str | None:
+def jump_sentence(bound: LipschitzBound, axes: Sequence[StateSpec], but: str = "") -> str | None:
     """How many cells there are, how many are marked, and the largest jump of each state; None for global constants."""
     if (cells := bound.cells) is None:
         return None
     many, marked = len(cells), int(cells.marked.sum())
     head = f"The constants hold per cell, of {many} that tile the domain"
     if not marked and bound.provenance == "interval":
-        return f"{head}; they were proved in each of them."
+        return f"{head}; they were proved in each of them{but}."
     if not marked:
         return f"{head}; none of them is marked: no slope grew as the distance shrank."
     units = {a.name: _unit(a) for a in axes}
@@ -335,6 +340,10 @@ def jump_sentence(bound: LipschitzBound, axes: Sequence[StateSpec]) -> str | Non
     )
 
 
+def _but(problem: GapProblem) -> str:
+    return "" if problem.symmetry is None else problem.symmetry.exception
+
+
 def curvature_sentences(problem: GapProblem, gap: GapFunction) -> list[str]:
     """What a gap function assumes of curvature."""
     h = problem.lipschitz.curvature
@@ -343,7 +352,7 @@ def curvature_sentences(problem: GapProblem, gap: GapFunction) -> list[str]:
     origin = {
         "estimated": "estimated",
         "declared": "declared and taken on trust",
-        "interval": "proved by interval arithmetic from the equations of both systems",
+        "interval": f"proved by interval arithmetic from the equations of both systems{_but(problem)}",
     }.get(problem.lipschitz.provenance, problem.lipschitz.provenance)
     bare = [s.name for s, row in zip(problem.domain.axes, h, strict=False) if np.isinf(row).any()]
     known = problem.lipschitz.provenance == "interval"  # then kinks have no curvature

@@ -9,9 +9,11 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.certification.certificate import Audit, Ledger, Record
+from gapcert.certification.certificate import Audit, Record
 from gapcert.certification.coordinates import in_words
+from gapcert.certification.fingerprint import Fingerprint
 from gapcert.certification.gates.hidden_state import Gate
+from gapcert.certification.ledger import Ledger
 from gapcert.certification.refutation import contradiction, curvature_contradiction, curvature_sentences, jump_sentence
 from gapcert.certification.samples.store import Store
 from gapcert.certification.supremum import supremum
@@ -21,6 +23,7 @@ from gapcert.contracts.gaps.gap import GapFamily, GapFunction, GapProblem
 from gapcert.contracts.gaps.predictor import Samples
 from gapcert.contracts.plugins.events import Pulse
 from gapcert.contracts.plugins.registry import registry
+from gapcert.contracts.systems.arithmetic import sentence
 from gapcert.contracts.systems.domain import Domain
 from gapcert.contracts.systems.system import Model, System
 from gapcert.numerics.arrays import Array, Ints
@@ -84,7 +87,7 @@ class Route(ABC):
         return self.name, backend
 
     def band(
-        self, gap: GapFunction, problem: GapProblem, request: Request, store: Store, ledger: Ledger, question: str
+        self, gap: GapFunction, problem: GapProblem, request: Request, store: Store, ledger: Ledger, question: Fingerprint
     ) -> tuple[GapFunction, Record | None]:
         """What is claimed of a fitted function, and the record of how it came about; here the function itself."""
         return gap, None
@@ -145,7 +148,8 @@ class _Bounded(_Audited):
         return _origin(problem)
 
     def refutation(self, problem: GapProblem, refuted: Refuted, states: Sequence[str]) -> str:
-        return f"REFUTED: two samples contradict the constants of {states[refuted['state']]} by {refuted['excess']:.3g}."
+        both = f": g changes by {refuted['change']:.6g}, and they allow {refuted['allowed']:.6g}" if "change" in refuted else ""
+        return f"REFUTED: two samples contradict the constants of {states[refuted['state']]} by {refuted['excess']:.3g}{both}."
 
 
 @final
@@ -222,32 +226,33 @@ def _envelope(gap: GapFunction, problem: GapProblem) -> GapFunction:
 def _assumptions(basis: Sequence[str], problem: GapProblem, audited: Audit, model: Model, gate: Gate) -> list[str]:
     """What the claim rests on, one sentence each, with provenance; `basis` is what γ itself does."""
     names = [s.name for s in model.states]
+    assert problem.arithmetics is not None, "certify looks at both"
     return [
         *basis,
-        "One step of f̂ and of f, as computed, is within e of its exact value: "
-        + ", ".join(f"e({n}) = {e:.2g}" for n, e in zip(names, problem.arithmetic, strict=True))
-        + ".",
+        sentence(*problem.arithmetics, names),
         f"f̂ is a function of its arguments alone: {gate.purity}; this was probed, not proved.",
         *gate.sentences(),
         *([problem.symmetry.sentence()] if problem.symmetry is not None else []),
         scope(model, problem.domain),
         f"The audit's {len(audited.z)} points are independent and uniform on {problem.domain.words}{gate.distribution} (audit "
         f"{audited.k} of this question); its statement does not carry over to other distributions, nor to a closed loop.",
+        *(f"Warning: {w}." for w in audited.entry.warnings),
     ]
 
 
 def _origin(problem: GapProblem) -> list[str]:
     """Whence the constants are, and where they jump."""
     bound, p = problem.lipschitz, problem.predictor
+    but = "" if problem.symmetry is None else problem.symmetry.exception
     what = "r" if p.kind == "none" else f"r − p (p: {p.kind} predictor)"
     from_where = {
-        "analytic": "were derived analytically",
-        "interval": "were proved by interval arithmetic from the equations of both systems",
+        "analytic": f"were derived analytically{but}",
+        "interval": f"were proved by interval arithmetic from the equations of both systems{but}",
         "declared": "were declared by the user and are taken on trust",
         "estimated": f"were estimated by {bound.method} from {bound.samples} transitions and multiplied by {bound.safety:g}; "
         f"an estimate is not a bound",
     }[bound.provenance]
-    jumps = jump_sentence(bound, problem.domain.axes)
+    jumps = jump_sentence(bound, problem.domain.axes, but)
     return [f"The per-axis Lipschitz constants of {what} {from_where}.", *filter(None, (jumps,))]
 
 

@@ -8,30 +8,10 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from gapcert.contracts.plugins.component import ALLOW_CODE, EXECUTED, SET, SPEC, Answer, Argument, Arguments, Component
-from gapcert.numerics.errors import GapcertError, UsageError
+from gapcert.contracts.plugins.component import EXECUTED, SET, SPEC, Answer, Argument, Arguments, Component
+from gapcert.numerics.errors import UsageError
 
-ORDERS = ("age", "name", "kind", "state", "size", "seconds")
-WORDS = (
-    *("running", "finished", "interrupted", "failed", "holds", "fails", "unknown"),
-    *("causes", "ambiguous", "nothing", "unexplained", "agree", "explained", "differ", "compared"),
-)
 _TICK: Mapping[str, Any] = {"action": "store_true"}
-_CHOSEN = (
-    Argument("--out", "where the run folders are (runs)", {"type": Path, "default": Path("runs"), "metavar": "DIR"}),
-    Argument(
-        "--name",
-        "names or folders such as 'pendulum*'; may be repeated",
-        {"action": "append", "default": [], "metavar": "PATTERN"},
-    ),
-    Argument(
-        "--state",
-        f"one of {', '.join(WORDS)}; may be repeated",
-        {"action": "append", "default": [], "metavar": "WORD", "choices": WORDS},
-    ),
-    Argument("--sort", f"one of {', '.join(ORDERS)}", {"default": "age", "choices": ORDERS, "metavar": "BY"}),
-)
-_KINDS = "model, backend, gap_family, lipschitz, synthesizer, effect, reader, executor, observer or study"
 
 
 def _command(name: str, summary: str, *arguments: Argument, does: str = "") -> Component:
@@ -55,41 +35,10 @@ COMMANDS = (
     ),
     _command("plugins", "list what is installed and what is missing, or begin a plugin"),
     _command(
-        "plugins new",
-        "write a plugin of your own: a working component, its contract test, and a spec that uses it",
-        Argument("KIND", _KINDS),
-        Argument("NAME", "its name in specs, such as my-robot"),
-        Argument("--out", "a new or empty folder for it (gapcert-NAME)", {"type": Path, "metavar": "DIR"}),
-        does="new_plugin",
-    ),
-    _command(
         "doctor",
         "say what this machine can do",
         Argument("--paste", "as a short block to paste into a report of a fault", _TICK),
         Argument("--licences", "the licence of every package that is needed, and by what", _TICK),
-    ),
-    _command("runs", "list, compare, clean and resume run folders", *_CHOSEN),
-    _command("runs list", "run folders with state, figures and size (what `gapcert runs` alone does)", *_CHOSEN, does="runs"),
-    _command(
-        "runs clean",
-        "which run folders would go; with --yes they do",
-        *_CHOSEN,
-        Argument("--older-than", "such as 30min, 12h, 7d, 2w", {"metavar": "AGE"}),
-        Argument("--larger-than", "such as 100MB, 2GB", {"metavar": "SIZE"}),
-        Argument("--keep-last", "keep the newest N of each name", {"default": 0, "type": int, "metavar": "N"}),
-        Argument("--all", "every folder that nothing else leaves out", _TICK),
-        Argument("--yes", "remove them", _TICK),
-        does="clean",
-    ),
-    _command(
-        "runs resume",
-        "go on with an interrupted run from its folder alone",
-        Argument("RUN", "the folder of a run"),
-        Argument("--executor", "another executor than the run was begun with", {"metavar": "NAME"}),
-        ALLOW_CODE,
-        Argument("--view", "open a live Rerun viewer", _TICK),
-        Argument("--quiet -q", "no progress", _TICK),
-        does="resume",
     ),
     _command(
         "watch",
@@ -151,12 +100,6 @@ def plugins(options: Arguments) -> Answer:
     return _listed(rows, () if options.json else columns(("kind", "name", "from", "available"), table))
 
 
-def new_plugin(options: Arguments) -> Answer:
-    from gapcert.cli.scaffold.scaffold import new
-
-    return Answer(*new(options.kind, options.name, options.out))
-
-
 def _listed(data: object, words: Iterable[str]) -> Answer:
     """A listing tells on stderr, and by its exit code, what `run` refuses."""
     from gapcert.contracts.plugins.registry import installed
@@ -183,50 +126,6 @@ def doctor(options: Arguments) -> Answer:
     parts = [(c["kind"], c["name"], "yes" if c["available"] else c["reason"]) for c in found["components"]]
     words = [*columns(("machine", ""), facts), "", *columns(("package", "version"), packages), ""]
     return _listed(found, [*words, *columns(("component", "", "available"), parts)])
-
-
-def runs(options: Arguments) -> Answer:
-    from gapcert.cli.listing import chosen, entry, table
-
-    rows = [entry(r) for r in chosen(options.out, options.name, options.state, options.sort)]
-    none = f"no run folders in {options.out}" + (" that match" if options.name or options.state else "")
-    return Answer(rows, table(rows) if rows else [none])
-
-
-def clean(options: Arguments) -> Answer:
-    from gapcert.cli.cleaning import Choice, remove, seconds, size
-    from gapcert.cli.listing import chosen, condition, entry, sized
-    from gapcert.numerics.texts import times
-
-    asked = (options.name, options.state, options.older_than, options.larger_than, options.keep_last, options.all)
-    if not any(asked):
-        raise UsageError(
-            "gapcert runs clean: nothing says which folders; give --state, --name, --older-than, --larger-than, --keep-last "
-            "or --all"
-        )
-    if options.keep_last < 0:
-        raise UsageError(f"--keep-last: found {options.keep_last}; expected a number from 0 on")
-    older = None if options.older_than is None else seconds(options.older_than)
-    larger = None if options.larger_than is None else size(options.larger_than)
-    choice = Choice(older, larger, options.keep_last)
-    goes, stays = choice.of(chosen(options.out, options.name, options.state, options.sort))
-    rows, failed = [entry(r) for r in goes], list[dict[str, str]]()
-    if options.yes:
-        for run in goes:
-            try:
-                remove(run)
-            except GapcertError as error:
-                failed.append({"run_dir": str(run.path), "reason": str(error)})
-    lost = {f["run_dir"] for f in failed}
-    gone = [r for r in rows if r["run_dir"] not in lost]
-    total = sum(r["size_bytes"] for r in gone)
-    kept = [{"run_dir": str(r.path), "reason": why} for r, why in stays] + failed
-    data = {"removed": options.yes, "folders": gone, "size_bytes": total, "kept": kept}
-    verb = "removed" if options.yes else "would go"
-    words = [f"{verb}: {r['run_dir']} ({condition(r)}, {sized(r['size_bytes'])})" for r in gone]
-    words += [f"stays: {k['run_dir']}: {k['reason']}" for k in kept]
-    words += [f"{times(len(gone), 'folder')}, {sized(total)}" + ("" if options.yes or not gone else "; --yes removes them")]
-    return Answer(data, words, UsageError.exit_code if failed else 0)
 
 
 def resume(options: Arguments) -> Answer:

@@ -22,11 +22,11 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.numerics.arrays import Array, Ints
+from gapcert.numerics.digest import json_digest
 from gapcert.numerics.errors import UsageError
 from gapcert.thresholds import THRESHOLDS
 
 STREAM = 0xCA11B
-"""Calibration k draws its points from (seed, k, STREAM), the audit after it from (seed, k)."""
 NOISE, NOISE_OF = ", the noise drawn once at each point", ", all of {} draws of the noise at each point"
 WINDOWS = "a further window that is exchangeable with those of the recording, on average over calibrations"
 DRAWN_WINDOWS = "a further window, drawn as those of the recording and independently of them"
@@ -137,6 +137,16 @@ def unit_rank(n: int, epsilon: float, beta: float | None) -> int:
     if (m := most_exceedances(n, epsilon, beta)) is None:
         raise UsageError(f"calibration: {n} units, and ε = {epsilon:g}, β = {beta:g} need {points_needed(epsilon, beta)}")
     return n - m
+
+
+def drawing(seed: int, k: int, stream: str, question: str = "", audited: str = "") -> np.random.Generator:
+    """What audit k of a question draws from: a hash, also of what is audited, so that no fit can know its points.
+
+    Without a question by the rule of books before format 2: (seed, k), or (seed, k, STREAM) for a calibration.
+    """
+    if question:
+        return np.random.default_rng(int(json_digest(seed, question, k, audited, stream), 16))
+    return np.random.default_rng([seed, *{"calibration": (k, STREAM), "attack": (0xA77AC,)}.get(stream, (k,))])
 
 
 def split(n: int, seed: int) -> Ints:

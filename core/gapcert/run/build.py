@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import Any, final
 
 from gapcert.certification.certificate import Certificate
-from gapcert.certification.certify import certify, digest
+from gapcert.certification.certify import certify
 from gapcert.certification.coordinates import Coordinates, RelativeGap, RelativeModel, RelativeSystem
 from gapcert.certification.declaration import Declaration
+from gapcert.certification.fingerprint import Fingerprint
 from gapcert.certification.gates.augment import augment, augment_model, unmeasured, widen
 from gapcert.certification.gates.hidden_state import HiddenPlan
 from gapcert.certification.routes import Request
@@ -154,7 +155,7 @@ class Build:
         )
         # As the run itself asks it: with hidden states that the domain names as states, but in the coordinates of the domain.
         model, backend = widen(model, backend, domain)
-        question, axes = digest(model, backend, domain), [a.name for a in domain.axes]
+        question, axes = Fingerprint(model, backend, domain), [a.name for a in domain.axes]
         extended = self.predictor(family, backend, domain)
         model, backend, domain = self.relative(model, backend, domain)
         made = certify(

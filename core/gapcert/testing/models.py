@@ -10,6 +10,7 @@ from gapcert.contracts.plugins.component import Context
 from gapcert.contracts.plugins.registry import registry
 from gapcert.contracts.systems.extension import Extension
 from gapcert.contracts.systems.system import Model
+from gapcert.numerics import circle
 from gapcert.numerics.arrays import Array, Bools
 from gapcert.numerics.errors import GapcertError, UsageError
 from gapcert.numerics.intervals import Interval
@@ -66,8 +67,8 @@ class ModelContract(SystemContract):
         for z in _inside(boxes):
             after = self._after(m, z)
             # An angle may come back from the other side of its circle.
-            turn = np.where(self._angles(m), np.round((out.mid - after) / (2 * np.pi)) * 2 * np.pi, 0.0)
-            bad = (after + turn < out.lo - e) | (after + turn > out.hi + e)
+            after = circle.near(after, out.mid, self._angles(m))
+            bad = (after < out.lo - e) | (after > out.hi + e)
             expect(not bad.any(), f"the next state of a point of a box lies outside its enclosure, {self._worst(m, bad)}")
 
     def test_enclosure_closes_in(self) -> None:
@@ -166,8 +167,7 @@ class ModelContract(SystemContract):
 
     def _change(self, m: Model, start: Array, end: Array) -> Array:
         """f(end) − f(start); angles by the shorter way, since a step may wrap them."""
-        d = self._after(m, end) - self._after(m, start)
-        return np.where(self._angles(m), d - np.round(d / (2 * np.pi)) * 2 * np.pi, d)
+        return circle.near(self._after(m, end) - self._after(m, start), 0.0, self._angles(m))
 
     def _angles(self, m: Model) -> Bools:
         return np.repeat([s.kind == "angle" for s in m.states], [s.size for s in m.states])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import pickle
 import subprocess
 import sys
@@ -11,6 +13,7 @@ from typing import Any, final
 
 import numpy as np
 
+from gapcert.certification.gates.purity import Queries, apart, contexts, held, laddered
 from gapcert.contracts.systems.domain import Domain
 from gapcert.contracts.systems.system import Parameter, StateSpec, Step, System, step_seed
 from gapcert.numerics.arrays import Array
@@ -121,6 +124,22 @@ class SystemContract(ABC):
             row = slice(k, k + 1)
             _same(_rows(out, row), s.step(x[row], u[row], **_take(options, row)), f"row {k} asked alone")
 
+    def test_company_does_not_matter(self) -> None:
+        s, x, u, options = self._query()
+        if "seed" in s.capabilities:
+            return
+        rows = laddered(s, Queries(x, u, options.get("hidden")))
+        first = apart(s, rows, 0)
+        for how, index, answer in itertools.chain(contexts(s, rows, 0), held(s, rows, first)):
+            _same(_rows(first, index), answer, f"rows {how}")
+
+    def test_failures_leave_no_trace(self) -> None:
+        s, x, u, options = self._query()
+        first = s.step(x, u, **options)
+        with contextlib.suppress(Exception):  # far away an engine may fail as it likes
+            s.step(1e3 * x, 1e3 * u, **options)
+        _same(first, s.step(x, u, **options), "the same query after one far outside")
+
     def test_fresh_instance_gives_the_same_bits(self) -> None:
         s, x, u, options = self._query()
         _same(s.step(x, u, **options), self.system().step(x, u, **options), "a fresh instance")
@@ -167,7 +186,11 @@ class SystemContract(ABC):
 
     def test_rollout_equals_steps(self) -> None:
         s, x, u, options = self._query()
-        steps = 4
+        self._rolled(s, x, u, options, 4)
+        few = slice(0, 2)
+        self._rolled(s, x[few], u[few], _take(options, few), 40)
+
+    def _rolled(self, s: System, x: Array, u: Array, options: dict[str, Any], steps: int) -> None:
         sequence = np.stack([np.roll(u, k, axis=0) for k in range(steps)], axis=1)
         whole = dict(options)
         if "forces" in options:

@@ -85,23 +85,32 @@ SOURCE = """\
 
 {tables}
 
-/* The angle itself within [low, high], else moved by whole turns to the one nearest to the middle. */
-static double turned(double v, double low, double high, double middle) {{
-  volatile double turns; /* one rounding after the product, and one after the sum */
-  if (!(v < low || v > high) || v - v != 0.0) return v;
-  turns = TURN * rint((middle - v) / TURN);
-  return v + turns;
+/* The angle on the turn of [low, high]: in it if and only if it lies on the nearest copy of it. ends: low, high, middle, and 1
+   for a full turn, which has no outside. */
+static double turned(double v, const double *ends) {{
+  volatile double turns, back, first, last; /* each is rounded once */
+  if (!(v < ends[0] || v > ends[1]) || v - v != 0.0) return v;
+  turns = TURN * rint((v - ends[2]) / TURN);
+  back = v - turns;
+  first = ends[0] + turns;
+  last = ends[1] + turns;
+  if (ends[3] == 0.0 && ((v < first && back < ends[0]) || (v > last && back > ends[1]))) return back;
+  return back < ends[0] ? ends[0] : back > ends[1] ? ends[1] : back;
+}}
+
+static void placed(const double x[CONTROLLER_STATES], const double box[CONTROLLER_STATES][4], double y[CONTROLLER_STATES]) {{
+  int j;
+  for (j = 0; j < CONTROLLER_STATES; j++) y[j] = is_angle[j] ? turned(x[j], box[j]) : x[j];
 }}
 
 static int grid_cell(const double x[CONTROLLER_STATES], size_t *cell) {{
   double y[CONTROLLER_STATES], v;
   size_t part[AXES], index = 0, low, high, middle, n;
   int j, left;
-  for (j = 0; j < CONTROLLER_STATES; j++)
-    y[j] = is_angle[j] ? turned(x[j], stay[j][0], stay[j][1], stay[j][2]) : x[j];
+  placed(x, stay, y);
   for (j = 0; j < HELD; j++) {{
     v = y[held_state[j]];
-    if (is_angle[held_state[j]]) v = turned(v, held[j][0], held[j][1], held[j][2]);
+    if (is_angle[held_state[j]]) v = turned(v, held[j]);
     if (!(v >= held[j][0] && v <= held[j][1])) return CONTROLLER_OUTSIDE;
   }}
   for (j = 0; j < AXES; j++) {{
@@ -211,8 +220,9 @@ static int in_shape(const double x[CONTROLLER_STATES], int k) {
   double y[CONTROLLER_STATES], d[CONTROLLER_STATES];
   volatile double total;
   int i, j;
+  placed(x, stay, d);
+  placed(d, shape_box[k], y);
   for (j = 0; j < CONTROLLER_STATES; j++) {
-    y[j] = is_angle[j] ? turned(x[j], shape_box[k][j][0], shape_box[k][j][1], shape_box[k][j][2]) : x[j];
     if (!(y[j] >= shape_box[k][j][0] && y[j] <= shape_box[k][j][1])) return 0;
     d[j] = y[j] - shape_centres[k][j];
   }
@@ -290,10 +300,10 @@ def _tables(controller: Exported, sets: npt.NDArray[np.uint8], which: npt.NDArra
     yield _rows("const double controller_points[CONTROLLER_POINTS][CONTROLLER_INPUTS]", one.points)
     yield _list("static const int by_effort", np.argsort(efforts(one.points), kind="stable"))
     yield _list("static const int is_angle", [int(a.kind == "angle") for a in stay.axes])
-    yield _rows("static const double stay[CONTROLLER_STATES][3]", ends_of(stay))
+    yield _rows("static const double stay[CONTROLLER_STATES][4]", ends_of(stay))
     # An array of no length is no C: one row stands there that is never read.
     yield _list("static const int held_state", others or [0])
-    yield _rows("static const double held[][3]", ends_of(one.held) if one.held else [[0.0] * 3])
+    yield _rows("static const double held[][4]", ends_of(one.held) if one.held else [[0.0] * 4])
     yield _list("static const int cell_state", one.on)
     yield _list("static const size_t first_edge", np.cumsum([0, *(len(e) for e in one.edges)]))
     yield _list("static const double edges", np.concatenate(one.edges))
@@ -318,7 +328,7 @@ def _memory(controller: AutomatonController) -> Iterable[str]:
         yield _list(f"static const {_kind(made[name])} {name}", made[name])
     yield _list("static const int shape_region", made["region"])
     boxes = ("{" + ",".join(_row(ends, float) for ends in shape) + "}" for shape in made["box"])
-    yield "static const double shape_box[][CONTROLLER_STATES][3] = {" + ",\n".join(boxes) + "};"
+    yield "static const double shape_box[][CONTROLLER_STATES][4] = {" + ",\n".join(boxes) + "};"
     yield _rows("static const double shape_centres[][CONTROLLER_STATES]", made["centres"])
     # As above, of what there is none of one row stands there.
     yield _list("static const int cut_of", _some(made["cut_of"]))

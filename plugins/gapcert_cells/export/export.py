@@ -16,7 +16,7 @@ from gapcert_cells.load import load_controller
 
 from . import standalone
 from .c import write_c
-from .parts import Exported, cells_of, memory_tables, parts_of, winning_of
+from .parts import Exported, cells_of, ends_of, memory_tables, parts_of, winning_of
 
 
 def write_numpy(controller: Exported, out: Path) -> list[Path]:
@@ -27,8 +27,8 @@ def write_numpy(controller: Exported, out: Path) -> list[Path]:
     tables |= {
         "points": one.points,
         "efforts": efforts(one.points),
-        "held": np.empty((2, 0)) if one.held is None else np.array([one.held.low, one.held.high]),
-        "stay": np.array([stay.low, stay.high]),
+        "held": np.empty((4, 0)) if one.held is None else np.array(ends_of(one.held)).T,
+        "stay": np.array(ends_of(stay)).T,
         "bits": np.stack([part.bits for part in parts]),
         "values": np.stack([part.values for part in parts]),
         "on": np.array(one.on),

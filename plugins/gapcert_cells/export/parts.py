@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.plugin import Box, Ellipsoid, Goal, Polytope
+from gapcert.plugin import Box, Ellipsoid, Goal, Polytope, circle
 from gapcert_cells.automaton_controller import AutomatonController
 from gapcert_cells.grid_controller import GridController
 
@@ -39,7 +39,7 @@ def memory_tables(controller: AutomatonController) -> dict[str, Table]:
 
 
 def _shapes(goal: Goal) -> dict[str, Table]:
-    """Convex shapes: in `box` (shapes, states, [low, high, middle]), all `cuts` a·x ≤ `bounds`, and Σ `factors` d_i d_j ≤ 1.
+    """Convex shapes: in `box` (shapes, states, 4) as `ends_of` has it, all `cuts` a·x ≤ `bounds`, and Σ `factors` d_i d_j ≤ 1.
 
     d = x − `centres`. Each cut and each term of a sum belongs to one shape; a shape without terms is no ellipsoid.
     """
@@ -56,7 +56,7 @@ def _shapes(goal: Goal) -> dict[str, Table]:
     ends = [ends_of(shape if isinstance(shape, Box) else shape.box) for _, shape in shapes]
     return {
         "region": np.array([p for p, _ in shapes], dtype=np.int64),
-        "box": np.array(ends, dtype=np.float64).reshape(*centres.shape, 3),
+        "box": np.array(ends, dtype=np.float64).reshape(*centres.shape, 4),
         "centres": centres,
         "cut_of": np.array([c[0] for c in cuts], dtype=np.int64),
         "cuts": np.array([c[1] for c in cuts], dtype=np.float64).reshape(-1, centres.shape[1]),
@@ -68,5 +68,5 @@ def _shapes(goal: Goal) -> dict[str, Table]:
 
 
 def ends_of(box: Box) -> list[list[float]]:
-    """[low, high, middle] per axis."""
-    return [[low, high, (low + high) / 2] for low, high in zip(box.low, box.high, strict=True)]
+    """[low, high, middle, 1 where that is a full turn] per axis."""
+    return [[a, b, (a + b) / 2, float(circle.spans(a, b))] for a, b in zip(box.low, box.high, strict=True)]

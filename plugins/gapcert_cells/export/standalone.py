@@ -41,11 +41,10 @@ class Controller:
         x, t = np.atleast_2d(np.asarray(x, dtype=np.float64)), self._tables
         if x.shape[1] != len(self.states):
             raise ValueError(f"controller: states have {x.shape[1]} numbers; expected {', '.join(self.states)}")
-        x = _turned(x, t["stay"][0], t["stay"][1], t["angle"])
+        x = _turned(x, t["stay"], t["angle"])
         others = np.setdiff1d(np.arange(len(self.states)), t["on"])
-        low, high = t["held"]
-        held = _turned(x[:, others], low, high, t["angle"][others])
-        inside = ((held >= low) & (held <= high)).all(axis=1)
+        held = _turned(x[:, others], t["held"], t["angle"][others])
+        inside = ((held >= t["held"][0]) & (held <= t["held"][1])).all(axis=1)
         index, parts, left = np.zeros(len(x), dtype=np.int64), [], int(t.get("halvings", 0))
         for j, edges in zip(t["on"], self._edges, strict=True):
             inside &= (x[:, j] >= edges[0]) & (x[:, j] <= edges[-1])
@@ -77,11 +76,11 @@ class Controller:
     def _letter(self, x: Any) -> Any:
         """(n,): the regions that the states are in, bit p for region p."""
         x, t = np.atleast_2d(np.asarray(x, dtype=np.float64)), self._tables
-        letter = np.zeros(len(x), dtype=np.int64)
+        x, letter = _turned(x, t["stay"], t["angle"]), np.zeros(len(x), dtype=np.int64)
         for k, region in enumerate(t["region"]):
-            low, high, _ = t["box"][k].T
-            y = _turned(x, low, high, t["angle"])
-            inside = ((y >= low) & (y <= high)).all(axis=1)
+            box = t["box"][k].T
+            y = _turned(x, box, t["angle"])
+            inside = ((y >= box[0]) & (y <= box[1])).all(axis=1)
             y, rows = y[inside], np.flatnonzero(inside)
             good = np.ones(len(y), dtype=bool)
             for a, bound in zip(t["cuts"][t["cut_of"] == k], t["bounds"][t["cut_of"] == k], strict=True):
@@ -123,8 +122,12 @@ class Controller:
         return self.points[(np.cumsum(allowed, axis=1) > rank[:, None]).argmax(axis=1)]
 
 
-def _turned(x: Any, low: Any, high: Any, angle: Any) -> Any:
-    """x with every angle outside [low, high] moved by whole turns to the one nearest to the middle."""
+def _turned(x: Any, box: Any, angle: Any) -> Any:
+    """x with every angle on the turn of the box: within its ends if and only if x lies on the nearest copy of it."""
+    low, high, middle, full = box
     out = angle & ((x < low) | (x > high)) & np.isfinite(x)
-    with np.errstate(invalid="ignore"):
-        return np.where(out, x + TURN * np.round(((low + high) / 2 - x) / TURN), x)
+    with np.errstate(invalid="ignore", over="ignore"):
+        moved = TURN * np.round((x - middle) / TURN)
+        back = x - moved
+        on = ((x >= low + moved) | (back >= low)) & ((x <= high + moved) | (back <= high))
+        return np.where(out, np.where((full > 0) | on, np.clip(back, low, high), back), x)

@@ -158,8 +158,7 @@ class Motions:
         for k, (_, _, steps) in enumerate(pieces):
             out[k, steps + 1 :] = np.nan
         self.recent.clear()
-        if model.backend.engine.forgets:
-            self.recent.update({(i, s): (model, a[: steps + 1]) for (i, s, steps), a in zip(pieces, out, strict=True)})
+        self.recent.update({(i, s): (model, a[: steps + 1]) for (i, s, steps), a in zip(pieces, out, strict=True)})
         return pieces, out
 
     def _begun(self, model: NativeModel, place: tuple[int, int], x: Array) -> Array:

@@ -150,7 +150,8 @@ def unexplained(found: Left) -> Unexplained:
     where, best = _where(found.short), found.best
     if best is None:
         return Unexplained(False, where=where)
-    kinds = {n: share for n, share in best.kinds.items() if share > 0}
+    # That none of them predicts anything is an answer as well.
+    kinds = {n: share for n, share in best.kinds.items() if share > 0} or dict(best.kinds)
     if best.memory > THRESHOLDS.learnt_share:
         return Unexplained(True, looks_like=kinds, where=where)
     if best.share > THRESHOLDS.learnt_share:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, final
 
 from gapcert_equations.programs.tape import Columns, Table, Tape
@@ -59,6 +59,11 @@ class Dynamics:
         mass, bounds = self.tape.outputs[: n * n], self.tape.outputs[n * n + n : n * n + 2 * n]
         off = any(m is not None for i, m in enumerate(mass) if i % (n + 1))
         return self.mechanical and off and any(b is not None for b in bounds)
+
+    @property
+    def once(self) -> Dynamics:
+        """One sub-step as a whole period."""
+        return replace(self, substeps=1, period=self.period / self.substeps)
 
     def substep(self, table: Table) -> Any:
         """The length of a sub-step in s."""

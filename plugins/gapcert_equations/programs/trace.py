@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any, final
 
@@ -345,7 +345,7 @@ def _traced(graph: Graph, dynamics: Dynamics, parameters: int, states: int, inpu
     u = [graph.leaf(f"u{i}", PERIOD) for i in range(inputs)]
     x = [graph.leaf(f"x{i}", SUBSTEP) for i in range(states)]
     z = [graph.leaf(f"z{i}", SUBSTEP) for i in range(memories)]
-    once = replace(dynamics, substeps=1, period=dynamics.period / dynamics.substeps)
+    once = dynamics.once
     with np.errstate(all="ignore"):
         new, kept = once.step(operations, once.prepare(operations, p), x, u, z)
     results = [r if isinstance(r, Symbol) else graph.number(r) for r in (*new, *kept)]

@@ -9,7 +9,7 @@ from typing import final
 
 import numpy as np
 
-from gapcert.plugin import TURN, Array, Bools, Box, Ellipsoid, Goal, Ints, Polytope, Region
+from gapcert.plugin import TURN, Array, Bools, Box, Ellipsoid, Goal, Ints, Polytope, Region, circle
 from gapcert_mpc.thresholds import THRESHOLDS
 
 from .linearise import Frame
@@ -45,13 +45,16 @@ def _turned(box: Box, polytope: Polytope | None, stay: Box, frame: Frame) -> Ite
     right = polytope.zone.bounds if polytope else np.zeros(0)
     middle, half = frame.x
     turns = [
-        range(int(np.ceil((a - h) / TURN)), int(np.floor((b - g) / TURN)) + 1) if axis.kind == "angle" else range(1)
+        circle.copies(g, h, a, b) if axis.kind == "angle" else range(1)
         for axis, g, h, a, b in zip(box.axes, low, high, stay.low, stay.high, strict=True)
     ]
+    turning = np.array([axis.kind == "angle" for axis in box.axes])
     for turn in itertools.product(*turns):
         move = TURN * np.asarray(turn, dtype=np.float64)
         a, b = (low + move - middle) / half, (high + move - middle) / half
-        if (a <= 1).all() and (b >= -1).all():
+        # A copy that stops short of `stay` is none of its parts; the frame may be wider.
+        near = (low + move <= stay.high) & (high + move >= stay.low) | ~turning
+        if near.all() and (a <= 1).all() and (b >= -1).all():
             cuts = matrix * half
             size = np.abs(cuts).max(axis=1, initial=1e-300)
             yield Part(a, b, cuts / size[:, None], (right + matrix @ (move - middle)) / size)

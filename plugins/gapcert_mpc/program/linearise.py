@@ -10,7 +10,7 @@ from typing import final
 import numpy as np
 
 import gapcert
-from gapcert.plugin import Array, Bools, Domain, GapFunction, Interval, Model, majorant_of
+from gapcert.plugin import Arithmetic, Array, Bools, Box, Domain, GapFunction, Interval, Model, circle, majorant_of
 from gapcert_mpc.thresholds import THRESHOLDS
 
 
@@ -32,6 +32,11 @@ class Frame:
 
     def out(self, zeta: Array) -> Array:
         return np.asarray(self.middle + self.half * zeta)
+
+    @property
+    def ends(self) -> tuple[Array, Array]:
+        """(low, high) of the box, and of what rounding makes of it."""
+        return self.middle - self.half * (1 + 1e-9), self.middle + self.half * (1 + 1e-9)
 
     @property
     def x(self) -> tuple[Array, Array]:
@@ -97,6 +102,16 @@ class Nominal:
         self.model, self.gap = model, gap
         self.predictor = None if gap is None else gap.predictor
         self.nx = model.nx
+        self._missed: dict[bytes, Array] = {}
+
+    def missed(self, low: Array, high: Array) -> Array:
+        """(nx,): by how much a computed step of f may differ from f in a box."""
+        key = low.tobytes() + high.tobytes()
+        if key not in self._missed:
+            parts = (self.model.states, slice(None, self.nx)), (self.model.inputs, slice(self.nx, None))
+            x, u = (Box(axes, tuple(low[part].tolist()), tuple(high[part].tolist())) for axes, part in parts)
+            self._missed[key] = Arithmetic.of(self.model, Domain(x, u)).e
+        return self._missed[key]
 
     def digest(self) -> str:
         """SHA-256 of f, and of what determines γ."""
@@ -179,17 +194,19 @@ class Nominal:
         return one.repeated(horizon + 1), F[used] / size[:, None]
 
     def line(self, low: Array, high: Array) -> tuple[Array, Array, Callable[[Interval], Interval]]:
-        """(ẑ (nz,), J (nx, nz), e): the middles of a box and of ∂F/∂z over it; e(cells) contains F(z) − F(ẑ) − J(z − ẑ).
+        """(ẑ (nz,), J (nx, nz), e): the middles of a box and of ∂F/∂z over it; e(cells) contains F(z) − F(ẑ) − J(z − ẑ),
+        F(z) as it is computed, too.
 
         Mean value form about each cell's own centre c: that is what it is at c, plus (F′(cell) − J)(z − c).
         """
         box = Interval(low[None], high[None])
         centre, slope = box.mid, self.slopes(box).mid[0]
         line, start = Interval.exact(slope), self.enclosed(Interval.exact(centre))
+        computed = start + Interval.around(0.0, self.missed(low, high))
 
         def left_out(cells: Interval) -> Interval:
             middle = Interval.exact(cells.mid)
-            at = self.enclosed(middle) - start - (line * (middle - centre)[:, None, :]).sum(-1)
+            at = self.enclosed(middle) - computed - (line * (middle - centre)[:, None, :]).sum(-1)
             return at + ((self.slopes(cells) - line) * (cells - middle)[:, None, :]).sum(-1)
 
         return centre[0], slope, left_out
@@ -210,7 +227,7 @@ class Nominal:
         slopes = self.slopes(boxes).reshape(THRESHOLDS.slope_parts, len(z), self.nx, -1)
         mean = sum((slopes[m] for m in range(1, THRESHOLDS.slope_parts)), slopes[0]) / THRESHOLDS.slope_parts
         left = self.left(Interval(at - below, at + above))
-        value, error = self._at(at)
+        value, error = self._at(at, frame)
         return in_frame(frame, mean.mid, value + left.mid, left.rad + error, mean.rad, z, low, high)
 
     def tangents(self, frame: Frame, z: Array, low: Array, high: Array, c: Array) -> Stages:
@@ -220,16 +237,14 @@ class Nominal:
         if self.predictor is not None:
             J = J + self.predictor.jacobian_over(Interval.exact(at)).mid
         c = np.tile(c * frame.x[1], (len(z), 1))
-        return in_frame(frame, J, self._at(at)[0], c, np.zeros_like(J), z, low, high)
+        return in_frame(frame, J, self._at(at, frame)[0], c, np.zeros_like(J), z, low, high)
 
-    def _at(self, z: Array) -> tuple[Array, Array]:
-        """F(z) but for whole turns of angles, and what it may be wrong by: (k, nx) each."""
+    def _at(self, z: Array, frame: Frame) -> tuple[Array, Array]:
+        """F(z) at points of the frame, but for whole turns of angles, and by how much it may be wrong: (k, nx) each."""
         x, u = z[:, : self.nx], z[:, self.nx :]
         after = self.model.step(x, u).x
-        for j, axis in enumerate(self.model.states):
-            if axis.kind == "angle":
-                after[:, j] += 2 * np.pi * np.round((x[:, j] - after[:, j]) / (2 * np.pi))
-        error = np.broadcast_to(self.model.resolution(np.abs(after).max(axis=0)), after.shape) * 2
+        after = circle.near(after, x, [axis.kind == "angle" for axis in self.model.states])
+        error = np.broadcast_to(self.missed(*frame.ends), after.shape) * 2
         if self.predictor is None:
             return after, error
         known = self.predictor.over(Interval.exact(z))

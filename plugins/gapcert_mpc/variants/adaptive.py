@@ -11,8 +11,8 @@ from typing import Any, NamedTuple, final
 
 import numpy as np
 
-from gapcert.plugin import Array, Bools, Controller, Goal, Interval, Ints, Policy, SynthesisProblem
-from gapcert_cells import loaded, write_saved
+from gapcert.plugin import Array, Bools, Controller, Goal, Interval, Ints, Outside, Policy, SynthesisProblem
+from gapcert_cells import inside_alone, loaded, write_saved
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.planning.plans import Memory
 from gapcert_mpc.program.linearise import Nominal
@@ -186,7 +186,9 @@ class AdaptiveMpcController(Controller):
             out[rows] = level.respond(x[rows], numbers, policy, seed, k)
         return out
 
-    def act(self, x: Array, policy: Policy = "first", seed: int = 0, k: int = 0) -> Array:
+    def act(self, x: Array, policy: Policy = "first", seed: int = 0, k: int = 0, *, outside: Outside = "raise") -> Array:
+        if outside == "nan":
+            return inside_alone(self, self.levels.family.problem.model.nu, x, policy, seed, k)
         return self.respond(x, self.start(x), policy, seed, k)
 
     def kept(self, x: Array, u: Array, after: Array, memory: Ints | None = None) -> Bools:

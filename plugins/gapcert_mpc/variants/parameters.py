@@ -12,7 +12,7 @@ from typing import Any, final
 import numpy as np
 
 from gapcert import Array, GapFunction, Interval, Model, Parameter, SynthesisProblem, UsageError, registry
-from gapcert.plugin import Bools, magnitude
+from gapcert.plugin import Bools, circle, magnitude
 from gapcert_mpc.thresholds import THRESHOLDS
 
 TURN = Interval(np.nextafter(2 * np.pi, 0.0), np.nextafter(2 * np.pi, 7.0))
@@ -217,7 +217,7 @@ class Membership:
     def _turned(self, x: Array, near: Array) -> Interval:
         """States (n, nx), angles by the turn that is nearest to `near`."""
         angles = np.array([s.kind == "angle" for s in self.family.problem.model.states])
-        turns = np.where(angles, np.round((x - near) / (2 * np.pi)), 0.0)
+        turns = np.where(angles, circle.turns(x, near), 0.0)
         moved = Interval.exact(x) - TURN * turns
         return Interval(np.where(turns != 0, moved.lo, x), np.where(turns != 0, moved.hi, x))
 

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple, final
 import numpy as np
 
 from gapcert import Array, Context, Controller, Domain, Goal, Model, SynthesisProblem, UsageError, load_controller, registry
-from gapcert.plugin import Bools, Ints, Policy, Synthesizer, of_config
-from gapcert_cells import GridController, loaded, write_saved
+from gapcert.plugin import Bools, Ints, Outside, Policy, Synthesizer, of_config
+from gapcert_cells import GridController, inside_alone, loaded, write_saved
 from gapcert_mpc.config import Terminal
 from gapcert_mpc.controller import MpcController
 from gapcert_mpc.planning.design import Design, Ends
@@ -276,7 +276,9 @@ class HandedController(Controller):
             out[handed] = self.then.respond(x[handed], own, self.policy, seed, k)
         return out
 
-    def act(self, x: Array, policy: Policy = "first", seed: int = 0, k: int = 0) -> Array:
+    def act(self, x: Array, policy: Policy = "first", seed: int = 0, k: int = 0, *, outside: Outside = "raise") -> Array:
+        if outside == "nan":
+            return inside_alone(self, len(self.design.frame.u[0]), x, policy, seed, k)
         return self.respond(x, self.start(x), policy, seed, k)
 
     def kept(self, x: Array, u: Array, after: Array, memory: Ints | None = None) -> Bools:

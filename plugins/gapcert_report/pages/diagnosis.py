@@ -14,6 +14,7 @@ from gapcert_report.words import words
 from gapcert_report.words.diagnosis import (
     briefly,
     cause_name,
+    dependence,
     experiment_sentence,
     explained,
     measured,
@@ -222,11 +223,9 @@ def _unit_of(test: str) -> str:
 def _unexplained(rest: Summary | None) -> Html | None:
     if not rest:
         return None
-    memory = "It has memory: no function of the present state and input makes it." if rest["needs_memory"] else (
-        "A function of the present state and input would do; it does not need memory."
-    )  # fmt: skip
-    parts: list[Html | None] = [h("p", memory)]
-    if where := rest.get("where"):
+    told = dependence(rest)
+    parts: list[Html | None] = [said(told)]
+    if (where := rest.get("where")) and "most of it at" not in told:
         parts.append(h("p", f"Most of it lies at {words.listed([f'{a:.3g} to {b:.3g} s' for a, b in where])}."))
     if kinds := rest.get("looks_like"):
         rows = [(k.replace("_", " "), f"{100 * v:.0f} %") for k, v in sorted(kinds.items(), key=lambda x: -x[1])]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import final
 
 from gapcert_figures import Figures
-from gapcert_report.words.words import Summary
+from gapcert_report.words.words import Summary, refutation
 
 from .control import loop_pictures
 from .diagnosis import DiagnosisAlbum, diagnosis_album
@@ -29,8 +29,9 @@ class Album:
 
 def album_of(figures: Figures, summary: Summary) -> Album:
     """Every picture of a run, by the section of the page where it stands."""
-    first, others = band_pictures(figures.gap) if figures.gap else ([], [])
-    gap = slice_pictures(figures.gap) if figures.gap else []
+    refuted = refutation(summary.get("certificate", {"claim": {}})) is not None
+    first, others = band_pictures(figures.gap, refuted) if figures.gap else ([], [])
+    gap = slice_pictures(figures.gap, refuted) if figures.gap else []
     loop, rest = loop_pictures(figures)
     d = diagnosis_album(figures.diagnosis, summary)
     if figures.recorded is not None:

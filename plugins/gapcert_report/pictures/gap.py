@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -10,17 +10,19 @@ from gapcert.plugin import Array
 from gapcert_figures import Band, GapFigure, RecordedFigure, Slice, Stretch, held
 from gapcert_report.words.words import number
 
-from .svg import FAINT, GOOD, TRUTH, WITH, Paint, Picture, draw, heat, scaled
+from .svg import BAD, FAINT, GOOD, TRUTH, WITH, Paint, Picture, draw, heat, scaled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 MOST_BANDS = 12  # beside those that lead: more make a page that nobody scrolls through
 GAP = "gap"  # pictures with one cursor
+_HOLLOW: dict[str, Any] = {"facecolor": "none", "edgecolor": FAINT, "lw": 0.8}  # no bound, and nothing like one
 
 
-def slice_pictures(gap: GapFigure) -> list[Picture]:
+def slice_pictures(gap: GapFigure, refuted: bool = False) -> list[Picture]:
     """Per state the true gap and γ over the first two axes, on one colour scale."""
+    called = "Refuted" if refuted else "Certified"
     at, dots = held(gap.fixed), len(gap.samples) <= 2000
     sampled = f"; dots: the {len(gap.samples):,} sampled points, projected" if dots else ""
 
@@ -40,32 +42,41 @@ def slice_pictures(gap: GapFigure) -> list[Picture]:
         truth, bound = f"|f̂ − f| of {s.state}{at}, evaluated afresh.", f"γ of {s.state}{at}, on the same colours{sampled}."
         pictures += [
             draw(f"gap{i}", f"True gap of {s.state}", truth, paint(s, s.gap, "|r|", False), link=GAP),
-            draw(f"gamma{i}", f"Certified bound γ of {s.state}", bound, paint(s, s.gamma, "γ", dots), link=GAP),
+            draw(f"gamma{i}", f"{called} bound γ of {s.state}", bound, paint(s, s.gamma, "γ", dots), link=GAP),
         ]
     return pictures
 
 
-def band_pictures(gap: GapFigure) -> tuple[list[Picture], list[Picture]]:
-    """The residual in its certified band: the one that leads for each state, and the others."""
+def band_pictures(gap: GapFigure, refuted: bool = False) -> tuple[list[Picture], list[Picture]]:
+    """The residual in its band: the one that leads for each state, and the others. A refuted band is hatched, not filled."""
     leads = gap.leads.values()
     others = [i for i in range(len(gap.bands)) if i not in leads][:MOST_BANDS]
-    return [_band(f"band{i}", gap.bands[i]) for i in leads], [_band(f"band{i}", gap.bands[i]) for i in others]
+    first, rest = ([_band(f"band{i}", gap.bands[i], refuted) for i in part] for part in (leads, others))
+    return first, rest
 
 
-def _band(key: str, b: Band) -> Picture:
+def _band(key: str, b: Band, refuted: bool) -> Picture:
     unit, label = scaled(b.unit, b.gamma, np.asarray(b.constant))
 
     def on(ax: Axes) -> None:
-        ax.fill_between(b.at, -b.gamma / unit, b.gamma / unit, color=WITH, alpha=0.16, lw=0, label="±γ")
-        ax.fill_between(b.at, b.low / unit, b.high / unit, color=WITH, alpha=0.55, lw=0, label="[l, u]")
+        for low, high, alpha, hatch, name in ((-b.gamma, b.gamma, 0.16, "", "±γ"), (b.low, b.high, 0.55, "////", "[l, u]")):
+            hollow = {**_HOLLOW, "hatch": hatch, "label": f"{name}, refuted"}
+            shown = hollow if refuted else {"color": WITH, "alpha": alpha, "label": name, "lw": 0}
+            if (some := low <= high).any():
+                ax.fill_between(b.at, low / unit, high / unit, where=some, **shown)
+        if b.empty.any():
+            crossed = {**_HOLLOW, "edgecolor": BAD, "hatch": "xxxx", "label": "no band: l above u"}
+            ax.fill_between(b.at, b.high / unit, b.low / unit, where=b.empty, **crossed)
         ax.plot(b.at, b.residual / unit, color=TRUTH, lw=1.1, label="f̂ − f")
         for sign in (-1, 1):
             ax.axhline(sign * b.constant / unit, color=FAINT, ls="--", lw=1, label="constant bound")
         ax.set(xlabel=b.axis.label, ylabel=f"gap of {b.state} [{label}]", xlim=(b.axis.low, b.axis.high))
         ax.set_ylim(-1.15 * b.constant / unit, 1.15 * b.constant / unit)
 
-    where = "stays inside" if b.inside else "leaves"
-    caption = f"Along {b.axis.name} through the middle of the domain: f̂ − f of {b.state} {where} its certified band."
+    where, band = "stays inside" if b.inside else "leaves", "refuted" if refuted else "certified"
+    caption = f"Along {b.axis.name} through the middle of the domain: f̂ − f of {b.state} {where} its {band} band."
+    if b.empty.any():
+        caption += f" Over {100 * b.empty.mean():.2g} % of the way no value is left in it: its ends have crossed."
     return draw(key, f"Gap of {b.state} along {b.axis.name}", caption, on, link=f"along {b.axis.name}")
 
 

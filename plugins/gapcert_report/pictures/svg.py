@@ -224,6 +224,8 @@ def _swatch(handle: Any) -> str:
     face, edge = (np.atleast_2d(get())[0] if np.size(get()) else None for get in (handle.get_facecolor, handle.get_edgecolor))
     parts = [f'{what}="{to_hex(c)}" {what}-opacity="{to_rgba(c)[3]:.3g}"'
              for what, c in (("fill", face), ("stroke", edge)) if c is not None]  # fmt: skip
+    if getattr(handle, "get_hatch", str)():
+        return f'<path d="M2 9L8 1M8 9L14 1M14 9L20 1" fill="none" stroke="{to_hex(handle.get_edgecolor())}"/>'
     dashed = ' stroke-dasharray="1.5 2"' if getattr(handle, "get_linestyle", str)() in (":", "dotted") else ""
     return f'<rect x="1" y="1" width="20" height="8" {" ".join(parts)}{dashed}/>'
 

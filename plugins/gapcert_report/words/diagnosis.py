@@ -233,8 +233,7 @@ def experiment_sentence(design: Summary) -> str:
 def _unexplained(summary: Summary) -> str:
     text = "Something is missing in the model that no effect in the library explains."
     rest = summary.get("unexplained") or {}
-    if rest.get("needs_memory"):
-        text += " It has memory: no law of the present state and input makes it."
+    text += f" {said}" if (said := dependence(rest)) else ""
     if kinds := {k: v for k, v in rest.get("looks_like", {}).items() if v > 0.1}:
         kind = max(kinds, key=lambda k: kinds[k])
         text += f" It looks like {KINDS.get(kind, kind)}: that predicts {100 * kinds[kind]:.0f} % of it in data not seen."
@@ -242,6 +241,22 @@ def _unexplained(summary: Summary) -> str:
         return text
     shares = [f"{cause_name(c)} ({100 * c['explained']:.3g} %)" for c in summary["causes"]]
     return f"{text} Part of the held-out error goes with {listed(shares)}, which this does not show to be a cause."
+
+
+def dependence(rest: Summary) -> str:
+    """What the residual that nothing explains goes with, as its features tell; "" where nothing was to be learnt from them."""
+    shares = rest.get("looks_like", {}).values()
+    if rest.get("needs_memory"):
+        return "It has memory: no law of the present state and input makes it."
+    if any(v > 0.1 for v in shares):
+        return "A function of the present state and input would do; it does not need memory."
+    if not shares:
+        return ""
+    if rest.get("events"):
+        return "No dependence on state, input or their past was found; single pushes from outside explain it."
+    when = listed([f"{a:.3g} to {b:.3g} s" for a, b in rest.get("where", ())])
+    most = f"most of it at {when}" if when else "about as much all along the recording"
+    return f"No dependence on state, input or their past was found; it looks like an external disturbance, {most}."
 
 
 def shrunk(summary: Summary) -> list[tuple[str, float, float]]:

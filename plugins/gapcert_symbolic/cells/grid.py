@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import Array, Box, Region, UsageError
-from gapcert.plugin import TURN, Bools, Ints
+from gapcert.plugin import TURN, Bools, Ints, circle
 
 Small = npt.NDArray[np.int32]
 CHUNK = 200_000
@@ -45,7 +45,8 @@ class Grid:
 
     def __post_init__(self) -> None:
         for axis, low, high in zip(self.box.axes, self.box.low, self.box.high, strict=True):
-            if axis.kind == "angle" and not (high - low) * (1 - 1e-15) <= TURN:
+            # Two turns less than that leave one, or more.
+            if axis.kind == "angle" and not circle.spans(high, low + 2 * TURN):
                 raise UsageError(
                     f"goal: stay has {axis.name} in [{low:g}, {high:g}] rad, more than a full turn; give at most 2π"
                 )
@@ -70,8 +71,7 @@ class Grid:
     @property
     def wraps(self) -> tuple[bool, ...]:
         """Axes that close on themselves: angles over a full turn. A narrower angle is a real number."""
-        widths = zip(self.box.axes, self.box.low, self.box.high, strict=True)
-        return tuple(axis.kind == "angle" and (high - low) * (1 + 1e-15) >= TURN for axis, low, high in widths)
+        return self.box.wraps
 
     @property
     def size(self) -> int:
@@ -157,24 +157,14 @@ class Grid:
         return 0.0 * self.widths if self.nodes is None else 1e-10 * self.widths
 
     def _axis(self, k: int, box: Box, outer: bool) -> Bools:
-        (lower, upper), found, j = self.ends[k], np.zeros(self.counts[k], dtype=bool), self.states[k]
-        for turns in self._turns(k, box):
-            # Moving by a turn rounds; the pad keeps obstacles too large and targets too small.
-            pad = 4 * np.spacing(TURN) * abs(turns) * (1 if outer else -1) + (self._rounded[k] if outer else 0.0)
-            low, high = box.low[j] + turns * TURN - pad, box.high[j] + turns * TURN + pad
-            if outer:
-                found |= (lower <= high) & (upper >= low)
-            else:
-                found |= (lower >= low) & (upper <= high)
+        (lower, upper), j = self.ends[k], self.states[k]
+        low, high, angle = box.low[j], box.high[j], box.axes[j].kind == "angle"
+        found = np.full(self.counts[k], angle and circle.spans(low, high))
+        for turns in circle.copies(low, high, self.box.low[k], self.box.high[k]) if angle else range(1):
+            # As states on the turn of the grid are held against the box: what holds of both ends of a cell holds within it.
+            first, last = (upper + self._rounded[k], lower - self._rounded[k]) if outer else (lower, upper)
+            found |= circle.between(low, high, turns, first, last)
         return found
-
-    def _turns(self, k: int, box: Box) -> range:
-        """By how many turns the box can be moved so that it may meet the grid, and one more on either side."""
-        j = self.states[k]
-        if box.axes[j].kind != "angle":
-            return range(1)
-        first, last = (self.box.low[k] - box.high[j]) / TURN, (self.box.high[k] - box.low[j]) / TURN
-        return range(int(np.floor(first)) - 1, int(np.ceil(last)) + 2)
 
     def _product(self, masks: list[Bools], cell: Ints | None) -> Bools:
         if cell is None:

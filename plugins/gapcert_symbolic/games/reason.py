@@ -1,5 +1,5 @@
-"""Why nothing wins: the first of the known causes, with its figures; and the smallest change after which something does, found
-by trying: a smaller gap, or more cells.
+"""Why nothing wins: the first cause, in the order goal, inputs, gap, cells, with its figures; and the smallest change after
+which something does, found by trying: a smaller gap, more cells, or wider inputs.
 """
 
 from __future__ import annotations
@@ -7,26 +7,33 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple, final
+from typing import Any, Literal, NamedTuple, final
 
 import numpy as np
 
-from gapcert import Array, Box, Goal, Interval, SynthesisProblem
+from gapcert import Array, Box, Goal, SynthesisProblem
 from gapcert.plugin import Bools
 from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.gaps import Disturbance
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.thresholds import THRESHOLDS
 
+from .authority import FAR, Drift, authority, drift
 from .games import Labels
 
 
 @final
 class Cause(NamedTuple):
-    """A sentence, and what must change before anything else can help: `gap_below`, `cells_above`, each by state."""
+    """A sentence, and what must change before anything else can help: `gap_below`, `cells_above`, each by state.
+
+    of: which part of the question is to blame for certain, so that changes of later parts need not be tried. `needed`: inputs
+    that are not proved to be too weak.
+    """
 
     text: str
     change: Mapping[str, Any] = MappingProxyType({})
+    of: Literal["goal", "inputs", ""] = ""
+    needed: Box | None = None
 
 
 def why_empty(
@@ -41,13 +48,15 @@ def why_empty(
     """What stands in the way, its size, and what to change."""
     goal = problem.goal
     if text := _unlabelled(goal, labels):
-        return Cause(text)
+        return Cause(text, of="goal")
     paths = tables()
     grid = paths.grid
     if text := _nothing_to_win(problem, paths, safe):
-        return Cause(text)
+        return Cause(text, of="goal")
     if goal.target is not None and not (target & safe).any():
         return _no_target(problem, grid, bool((target & ~safe).any()))
+    if (moved := drift(problem, grid, inputs)) is not None:
+        return _too_weak(moved, inputs)
     axes, widths, gamma = grid.box.axes, grid.widths, _gamma(added, grid)
     by_input, total = authority(problem, grid, inputs)
     driven = by_input > 0
@@ -76,7 +85,7 @@ def why_empty(
                 f"most {d:.3g} per step, so no cell can be left for certain; use more cells, above {least}",
                 {"cells_above": {a.name: least}},
             )
-    return Cause(_figures(problem, grid, gamma, total))
+    return Cause(f"{_figures(problem, grid, gamma, total)}; use more cells, a smaller gap or a wider goal")
 
 
 def _unlabelled(goal: Goal, labels: Labels | None) -> str:
@@ -94,6 +103,30 @@ def _nothing_to_win(problem: SynthesisProblem, paths: Windows, safe: Bools) -> s
         texts = ", ".join(dict.fromkeys(r.text for r in problem.domain.relations))
         return f"no input keeps the relations ({texts}) for all states of any cell; use smaller cells or more inputs"
     return ""
+
+
+def _too_weak(moved: Drift, inputs: Box) -> Cause:
+    a, needed = moved.axis, moved.needed
+    by = f"moves {a.name} by {moved.low:.3g} to {moved.high:.3g} {a.unit} wherever the goal has it stay, for γ = 0 too"
+    if needed is None:
+        wide = f"even with inputs {FAR} times as wide"
+        return Cause(f"{a.name}: each step {by}, {wide}, so the goal cannot be kept; choose another goal", of="goal")
+    own, wider = ranges(inputs, needed), ranges(needed, inputs)
+    return Cause(
+        f"{a.name}: the inputs are too weak: with {own} each step {by}, so the goal cannot be kept, by cells of any size; "
+        f"about {wider} is needed at the least",
+        of="inputs",
+        needed=needed,
+    )
+
+
+def ranges(inputs: Box, other: Box) -> str:
+    """Those that differ from the other's, in words."""
+    rows = zip(inputs.axes, inputs.low, inputs.high, other.low, other.high, strict=True)
+    told = [
+        f"{axis.name} in [{a:.3g}, {b:.3g}] {axis.unit}".removesuffix(" 1") for axis, a, b, c, d in rows if (a, b) != (c, d)
+    ]
+    return " and ".join(told)
 
 
 def _gamma(added: Disturbance | None, grid: Grid) -> Array:
@@ -124,12 +157,12 @@ def _figures(problem: SynthesisProblem, grid: Grid, gamma: Array, total: Array) 
         for a, w, g, d in zip(grid.box.axes, grid.widths, gamma, total, strict=True)
     )
     if goal.automaton is not None:
-        return f"no cell wins against '{goal.automaton.text}' ({figures}); use more cells, a smaller gap or wider regions"
+        return f"no cell wins against '{goal.automaton.text}' ({figures})"
     if goal.kind == "reach_avoid":
-        return f"no cell is led into the target for certain ({figures}); use more cells, a smaller gap or a wider target"
+        return f"no cell is led into the target for certain ({figures})"
     what = "cells" if goal.target is None else "target cells"
     verb = "visited again and again" if goal.kind == "recurrence" else "kept for ever"
-    return f"no set of {what} can be {verb} ({figures}); use more cells, a smaller gap or a wider goal"
+    return f"no set of {what} can be {verb} ({figures})"
 
 
 def _leaves(paths: Windows, k: int) -> bool:
@@ -139,29 +172,6 @@ def _leaves(paths: Windows, k: int) -> bool:
     least, most = np.maximum(0, -axis.first), np.minimum(n - 1, n - 1 - axis.last) if axis.moves else n - 1 - axis.last
     inside = least <= most if axis.moves else (least == 0) & (most >= 0)
     return not paths.grid.wraps[k] and not bool(inside.any())
-
-
-def authority(problem: SynthesisProblem, grid: Grid, inputs: Box) -> tuple[Array, Array]:
-    """Upper bounds over the goal's box and all inputs, per state with cells, of what one step can do.
-
-    By the inputs: |f_i(x, u) − f_i(x, v)| ≤ |∂f/∂u| ρ with v the middle. In total: |f_i(x, u) − x_i| ≤
-    |f(c, v) − c| + |∂f/∂x − 1| r + |∂f/∂u| ρ, cell by cell.
-    """
-    nx, step = problem.domain.nx, 20_000
-    by_input, total = np.zeros(nx), np.zeros(nx)
-    u = inputs.interval
-    for start in range(0, grid.size, step):
-        low, high = grid.cells(start, start + step)
-        z = Interval.concatenate([Interval(low, high), Interval(u.lo.repeat(len(low), 0), u.hi.repeat(len(low), 0))], axis=1)
-        centre = z.mid
-        slope = problem.model.jacobian_enclosure(z) - np.eye(nx, z.shape[1])
-        spread = slope * (z - centre).reshape(len(low), 1, z.shape[1])
-        moved = problem.model.enclosure(Interval.exact(centre)) - centre[:, :nx] + spread.sum(-1)
-        by_input = np.maximum(by_input, spread[:, :, nx:].mag.sum(-1).max(axis=0))
-        total = np.maximum(total, moved.mag.max(axis=0))
-    # Outward rounding leaves a residue of 1e-300 where an input has no effect.
-    states = list(grid.states)
-    return np.where(by_input > 1e-250, by_input, 0.0)[states], total[states]
 
 
 def _no_target(problem: SynthesisProblem, grid: Grid, blocked: bool) -> Cause:
@@ -210,10 +220,15 @@ def _scale(wins: Callable[[float, int], bool], factor: int) -> float | None:
     return float(low / 2**THRESHOLDS.change_halvings)
 
 
-def in_words(change: dict[str, Any]) -> str:
-    """As the end of a sentence; "" where nothing is known to help."""
+def in_words(change: dict[str, Any], inputs: Box, without: bool, all_tried: bool) -> str:
+    """As the end of a sentence; "" where nothing is known. without: was γ = 0 tried, where no `gap_scale` came of it?"""
     parts = [*_parts(change), *([" and ".join(_parts(change["both"]))] if "both" in change else [])]
-    return f"; with {', or with '.join(parts)}, some cell wins" if parts else ""
+    told = f"; with {', or with '.join(parts)}, some cell wins" if parts else ""
+    if (wider := change.get("inputs")) is not None:
+        told += f"; for γ = 0, {ranges(Box.of(inputs.axes, wider), inputs)} suffices"
+    elif not parts and all_tried:
+        told = f"; neither do more cells help, nor inputs {FAR} times as wide"
+    return f"; for γ = 0 nothing wins either, with these cells and inputs{told}" if without else told
 
 
 def _parts(change: dict[str, Any]) -> list[str]:

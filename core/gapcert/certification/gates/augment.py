@@ -85,6 +85,9 @@ class Augmented(Backend):
         own, plain = self.system.resolution(magnitude[:nx]), super().resolution(magnitude)
         return np.concatenate([own, plain[nx:] * max(1.0, float((own / plain[:nx]).max()))])
 
+    def repeats(self, angle: str) -> str | None:
+        return self.system.repeats(angle) if angle not in self.names else None
+
     def digest(self) -> str:
         return json_digest(type(self).__qualname__, self.system.digest(), self.names)
 
@@ -145,8 +148,15 @@ class AugmentedModel(Model):
         """h⁺ = h is exact."""
         return np.concatenate([self.model.resolution(magnitude[: self.model.nx]), np.zeros(len(self.added))])
 
+    def rounding_over(self, z: Interval) -> Array | None:
+        inner = self.model.rounding_over(self._inner(z))
+        return None if inner is None else np.hstack([inner, np.zeros((len(z), len(self.added)))])
+
     def digest(self) -> str:
         return json_digest(type(self).__qualname__, self.model.digest(), [[s.name, s.unit, s.kind] for s in self.added])
+
+    def repeats(self, angle: str) -> str | None:
+        return "" if angle in [s.name for s in self.added] else self.model.repeats(angle)
 
     def extend(self, extensions: Sequence[Extension]) -> Model:
         return AugmentedModel(self.model.extend(extensions), self.added)
@@ -206,6 +216,12 @@ class Resting(Model):
 
     def resolution(self, magnitude: Array) -> Array:
         return self.model.resolution(magnitude)
+
+    def rounding_over(self, z: Interval) -> Array | None:
+        return self.model.rounding_over(z)
+
+    def rounding_terms(self, z: Interval) -> tuple[str, ...]:
+        return self.model.rounding_terms(z)
 
     def digest(self) -> str:
         return json_digest(type(self).__qualname__, self.model.digest())

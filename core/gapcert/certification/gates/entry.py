@@ -12,7 +12,7 @@ import numpy as np
 
 from gapcert.certification.gates.hidden_distribution import HiddenDraws, Paired
 from gapcert.certification.gates.hidden_state import Gate, HiddenPlan, open_gate
-from gapcert.certification.gates.purity import purity
+from gapcert.certification.gates.purity import answered, purity
 from gapcert.certification.samples.store import Store
 from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.gaps.lipschitz import Residual
@@ -51,11 +51,12 @@ def enter(
     def told(of: str) -> Callable[[str], None]:
         return lambda what: pulse(next(probes), text=f"{of} {what}")
 
+    first = answered(backend, domain, seed)
     for role, system in (("model", model), ("backend", backend)):
         probed = purity(role, system, domain, executor, seed, told(role))
     gate = open_gate(model, backend, domain, plan, seed, told("hidden state,"))
     pulse(next(probes), text="do inputs arrive?")
-    if claim == "deterministic" and gate.distribution:
+    if claim == "deterministic" and gate.probe is not None and not gate.probe.harmless:
         raise UsageError(
             f"certificate.claim: deterministic cannot be had with hidden: {gate.plan.mode}, which estimates or leaves out what "
             f"hidden state does ({', '.join(gate.names)}); use hidden: augment, or ask for a statistical claim"
@@ -63,7 +64,7 @@ def enter(
     warnings = tuple(responses(Residual(gate.system, model), domain, seed))
     for warning in warnings:
         emit(Event("warning", "gates", {"message": warning}))
-    return replace(gate, purity=probed, warnings=warnings)
+    return replace(gate, purity=probed, warnings=warnings, first=first)
 
 
 def responses(residual: Residual, domain: Domain, seed: int) -> list[str]:

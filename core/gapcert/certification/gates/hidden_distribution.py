@@ -74,32 +74,43 @@ class Pool:
 
 
 def visited(
-    system: System, domain: Domain, runs: int, steps: int, seed: int, tell: Callable[[int], None] = lambda steps: None
+    system: System,
+    domain: Domain,
+    runs: int,
+    steps: int,
+    seed: int,
+    tell: Callable[[int], None] = lambda steps: None,
+    long: bool = False,
 ) -> Pool:
     """`runs` rollouts from random states, hidden handed on from the declared default, a fresh random input in each step.
 
     Inputs are drawn such that (x, u) lies in the domain, relations included; a run that leaves it starts anew. The first
     quarter of the steps is left out: there the hidden state still remembers a start that nothing led to. tell: called with
-    the steps that are done.
+    the steps that are done. long: nothing is left out, inputs are held for 1, 2, 4, … 128 steps, and a run that starts anew
+    hands its hidden state on, so that what adds up over all steps does.
     """
     rng = np.random.default_rng([seed, 0x41DD])
     x, u = (np.ascontiguousarray(part) for part in domain.split(domain.draw(runs, rng)))
-    hidden, age = default(system, runs), np.zeros(runs, dtype=int)
+    hidden, age, hold = default(system, runs), np.zeros(runs, dtype=int), 2 ** (np.arange(runs) % 8)
     xs, hs = [], []
     for k in range(steps):
         tell(k)
         out = system.step(x, u, hidden=hidden)
         assert out.hidden is not None, "a system with hidden state hands it on"
         x, hidden, age = out.x, out.hidden, age + 1
-        u, inside = inputs(domain, x, rng)
-        kept = inside & (age > steps // 4)
+        before, (u, inside) = u, inputs(domain, x, rng)
+        if long:
+            held = (age % hold > 0) & domain.contains(np.hstack([x, before]))
+            u = np.where(held[:, None], before, u)
+        kept = inside & (long | (age > steps // 4))
         xs.append(x[kept])
         hs.append(hidden[kept])
         if (lost := ~inside).any():
             fresh = domain.draw(int(lost.sum()), rng)
             x, u, hidden, age = x.copy(), u.copy(), hidden.copy(), age.copy()
             x[lost], u[lost] = domain.split(fresh)
-            hidden[lost], age[lost] = default(system, len(fresh)), 0
+            if not long:
+                hidden[lost], age[lost] = default(system, len(fresh)), 0
     return Pool(np.concatenate(xs), np.concatenate(hs))
 
 
@@ -124,27 +135,32 @@ def change(system: System, a: Array, b: Array) -> Array:
 
 
 class Law(ABC):
-    """A distribution of the hidden state, which may depend on x."""
+    """A distribution of the hidden state, which may depend on x; its draws keep columns `index` between `low` and `high`."""
+
+    low: Array
+    high: Array
+    index: Any = slice(None)
 
     @abstractmethod
     def draw(self, key: Keys, x: Array) -> Array:
         """(n, nh): one draw per row, by its key alone."""
 
-    @abstractmethod
     def extremes(self, x: Array, count: int) -> list[Array]:
-        """About `count` alternatives (n, nh) at the same x, which span the distribution's support."""
+        """About `count` alternatives (n, nh) at the same x, which span the distribution's support; here, draws."""
+        return [self.draw(keys(k, x), x) for k in range(count)]
 
-    @abstractmethod
     def outside(self, hidden: Array) -> Bools:
         """(n,): which hidden states certainly lie outside what draws can reach, since they leave its box."""
+        h = hidden[:, self.index]
+        return np.asarray(((h < self.low) | (h > self.high)).any(axis=1))
 
     @abstractmethod
     def describe(self) -> str:
         """The distribution in words, after `hidden state`."""
 
-    @abstractmethod
     def follows(self) -> str:
         """What is assumed, besides, of a law that depends on x: constants are those under a common hidden state."""
+        return ""
 
     @abstractmethod
     def digest(self) -> str:
@@ -191,15 +207,8 @@ class Ranges(Law):
             out.append(h)
         return out
 
-    def outside(self, hidden: Array) -> Bools:
-        h = hidden[:, self.index]
-        return np.asarray(((h < self.low) | (h > self.high)).any(axis=1))
-
     def describe(self) -> str:
         return "uniform on " + " × ".join(f"{n} ∈ [{low:g}, {high:g}]" for n, (low, high) in self.ranges.items())
-
-    def follows(self) -> str:
-        return ""
 
     def digest(self) -> str:
         return json_digest("ranges", self.ranges, self.base)
@@ -239,9 +248,6 @@ class Visited(Law):
         index = self.nearest(x)
         return [self.pool.h[index[:, k]] for k in range(self.near)]
 
-    def outside(self, hidden: Array) -> Bools:
-        return np.asarray(((hidden < self.low) | (hidden > self.high)).any(axis=1))
-
     def describe(self) -> str:
         return f"that of one of the {self.near} nearest of {len(self.pool)} states visited in rollouts"
 
@@ -256,6 +262,31 @@ class Visited(Law):
         for array in (self.pool.x, self.pool.h, self.scale):
             h.update(np.ascontiguousarray(array).tobytes())
         return h.hexdigest()
+
+
+@final
+class Around(Law):
+    """Hidden state that seemed harmless: at its default, as long rollouts leave it, or moved, a third each."""
+
+    def __init__(self, system: System, domain: Domain, ranges: Mapping[str, Range], seed: int) -> None:
+        met = visited(system, domain, THRESHOLDS.harmless_runs, THRESHOLDS.harmless_steps, seed, long=True).h
+        rng, base = np.random.default_rng([seed, 0x41E0]), default(system, max(1, len(met)))
+        far = base + rng.random(base.shape) * (moved(system, len(base), rng, ranges) - base)
+        for spec, part in zip(system.hidden, columns(system.hidden), strict=True):
+            if spec.kind == "quaternion":
+                far[:, part] /= np.linalg.norm(far[:, part], axis=1, keepdims=True)
+        self.pool = np.vstack([base, met if len(met) else base, far])
+        self.low, self.high = self.pool.min(axis=0), self.pool.max(axis=0)
+
+    def draw(self, key: Keys, x: Array) -> Array:
+        return np.asarray(self.pool[(uniforms(key, 1)[:, 0] * len(self.pool)).astype(np.intp)])
+
+    def describe(self) -> str:
+        long = f"as rollouts of up to {THRESHOLDS.harmless_steps} steps leave it"
+        return f"in equal parts at its default, {long}, and moved from its default as the probe does"
+
+    def digest(self) -> str:
+        return json_digest("around", hashlib.sha256(self.pool.tobytes()).hexdigest())
 
 
 @final

@@ -10,6 +10,7 @@ import numpy as np
 
 from gapcert.certification.gates.augment import Augmented
 from gapcert.certification.gates.hidden_distribution import (
+    Around,
     HiddenDraws,
     Law,
     Pool,
@@ -22,6 +23,7 @@ from gapcert.certification.gates.hidden_distribution import (
     moved,
     visited,
 )
+from gapcert.certification.ledger import Entry
 from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.gaps.gap import GapFunction, GapProblem
 from gapcert.contracts.gaps.lipschitz import Residual
@@ -93,9 +95,11 @@ class Probe:
 @final
 @dataclass(frozen=True)
 class Gate:
-    """What the gates found: `purity` in words, `warnings`, and the branch that was taken with hidden state.
+    """What the gates found: `purity` and `turns` in words, `warnings`, and the branch that was taken with hidden state.
 
     `system` is what is sampled, `bound` (nx,) the spread that acts as further resolution; it cost `spent` transitions.
+    `audited`, if set, is asked by the audit instead: hidden state that a probe found harmless is drawn there all the same.
+    `first`: see `purity.answered`.
     """
 
     plan: HiddenPlan
@@ -106,15 +110,19 @@ class Gate:
     probe: Probe | None = None
     law: Law | None = None
     purity: str = ""
+    turns: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     spent: int = 0
     attack: Mapping[str, Any] = field(default_factory=dict)
+    audited: System | None = None
+    first: Any = None
 
     @property
     def distribution(self) -> str:
-        """What the audit's distribution says of the hidden state; empty where it does not matter."""
-        if self.law is not None:
-            return f", hidden state {self.law.describe()}"
+        """What the audit's distribution says of the hidden state; empty where there is none."""
+        law = self.audited.law if isinstance(self.audited, HiddenDraws) else self.law
+        if law is not None:
+            return f", hidden state {law.describe()}"
         return ", hidden state at its default" if self.probe is not None and not self.probe.harmless else ""
 
     def summary(self) -> dict[str, Any]:
@@ -145,7 +153,8 @@ class Gate:
         """What the claim owes to the gates, for the list of assumptions."""
         made = [f"Hidden state that the domain names ({', '.join(self.names)}) is state here, and f holds it constant."]
         found = made if self.plan.mode == "augment" and self.names else []
-        return [*found, *([] if self.probe is None else [self._hidden(self.probe)]), *(f"Warning: {w}." for w in self.warnings)]
+        hidden = [] if self.probe is None else [self._hidden(self.probe)]
+        return [*self.turns, *found, *hidden, *(f"Warning: {w}." for w in self.warnings)]
 
     def _hidden(self, p: Probe) -> str:
         listed = ", ".join(p.names)
@@ -185,7 +194,12 @@ def open_gate(
     pool = visited(backend, domain, THRESHOLDS.hidden_runs, steps, seed, lambda k: tell(f"rollouts, step {k + 1} of {steps}"))
     tell("moved at random points")
     probed = probe(Residual(backend, model), domain, plan.ranges, pool, seed)
-    if probed.harmless or plan.mode == "default":
+    if probed.harmless:
+        tell("harmless so far, and drawn in the audit")
+        drawn = HiddenDraws(backend, Around(backend, domain, plan.ranges, seed + 3), seed)
+        spent = THRESHOLDS.harmless_runs * THRESHOLDS.harmless_steps
+        return Gate(plan, backend, states, augmented or names, none, probed, spent=spent, audited=drawn)
+    if plan.mode == "default":
         return Gate(plan, backend, states, augmented or names, none, probed)
     if plan.mode != "sample":
         raise UsageError(_refusal(probed, plan.mode == "augment", states, backend))
@@ -258,18 +272,22 @@ def spread(draws: HiddenDraws, domain: Domain, seed: int) -> Array:
     return np.asarray(np.ptp(d, axis=0).max(axis=0) / 2)
 
 
-def attacked(gate: Gate, gap: GapFunction, problem: GapProblem, model: Model, emit: Emit = silent, n: int = 256) -> Gate:
+def attacked(
+    gate: Gate, gap: GapFunction, problem: GapProblem, model: Model, enter: Callable[[], Entry], emit: Emit = silent
+) -> Gate:
     """γ of the default hidden state, asked about others: the share of probes with |r| > γ, and the worst.
 
-    Half of the probes move the hidden state as the gate does, the others are visited in rollouts. Where hidden state does not
-    matter or is drawn, the audit has asked already.
+    `enter` has the book count it: by that entry it is drawn, so that no fit can know what is asked. Half of the probes move the
+    hidden state as the gate does, the others are visited in rollouts. Where hidden state does not matter or is drawn, the
+    audit has asked already.
     """
     if gate.probe is None or gate.probe.harmless or gate.law is not None:
         return gate
-    backend, domain, rng = gate.system, problem.domain, np.random.default_rng([problem.seed, 0xA77AD])
+    backend, domain, entry, n = gate.system, problem.domain, enter(), THRESHOLDS.hidden_attack
+    rng = entry.draws(problem.seed, "hidden state")
     x, u = (np.ascontiguousarray(part) for part in domain.split(domain.draw(n, rng)))
     pulse = Pulse(emit, "attack", THRESHOLDS.hidden_steps + -(-2 * n // _BLOCK), "steps", "from other hidden states")
-    met = visited(backend, domain, max(THRESHOLDS.hidden_runs, n // 8), THRESHOLDS.hidden_steps, problem.seed + 2, pulse)
+    met = visited(backend, domain, n // 8, THRESHOLDS.hidden_steps, int(rng.integers(2**32)), pulse)
     parts = [(x, u, moved(backend, n, rng, gate.plan.ranges)), _met(domain, met, rng, n)]
     x, u, h = (np.concatenate(part) for part in zip(*parts, strict=True))
     gamma, after = gap.gamma(np.hstack([x, u])), []
@@ -279,7 +297,8 @@ def attacked(gate: Gate, gap: GapFunction, problem: GapProblem, model: Model, em
         after.append(backend.step(x[block], u[block], hidden=h[block]).x)
     r = difference(model.states, np.concatenate(after), model.step(x, u).x)
     above = (np.abs(r) > gamma).any(axis=1)
-    out: dict[str, Any] = {"points": len(x), "violations": int(above.sum()), "share": float(above.mean())}
+    counts = {"points": len(x), "violations": int(above.sum()), "share": float(above.mean())}
+    out: dict[str, Any] = counts | entry.summary()
     if above.any():
         k, i = np.unravel_index(int(np.argmax(np.abs(r) / np.maximum(gamma, np.finfo(float).tiny))), r.shape)
         witness = {"z": [*x[k].tolist(), *u[k].tolist()], "hidden": h[k].tolist(), "state": gate.states[i]}

@@ -20,8 +20,10 @@ from typing import Any, NamedTuple, final
 import numpy as np
 import numpy.typing as npt
 
+from gapcert.certification.gates.again import in_calls
 from gapcert.certification.samples.executors import abandon, cores, done_with, processes
 from gapcert.certification.samples.extremes import Extremes
+from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.gaps.lipschitz import Residual
 from gapcert.contracts.gaps.predictor import Samples
 from gapcert.contracts.plugins.events import Emit, Event, silent
@@ -50,6 +52,7 @@ class Task(NamedTuple):
     first: int
     extremes: Extremes | None
     target: Path | None
+    in_calls: bool = False
 
 
 @final
@@ -83,7 +86,7 @@ def compute_chunk(task: Task) -> Done:
     for a in range(0, len(r), _BLOCK):
         z = task.points.chunk(task.start + a, min(task.start + a + _BLOCK, task.stop))
         part = r[a : a + len(z)]
-        part[:] = _asked(residual, z)
+        part[:] = _asked(residual, z, task.in_calls)
         if not np.isfinite(part).all():
             row = int(np.flatnonzero(~np.isfinite(part).all(axis=1))[0])
             raise UsageError(
@@ -100,10 +103,10 @@ def compute_chunk(task: Task) -> Done:
     return _deliver(task, (hashlib.sha256(header + data).hexdigest(), sha256.hexdigest()), largest, header, data)
 
 
-def _asked(residual: Residual, z: Array) -> Array:
+def _asked(residual: Residual, z: Array, apart: bool) -> Array:
     """r at points z; what a system raises on its own becomes a sentence that says where."""
     try:
-        return residual(z)
+        return in_calls(residual, z) if apart else residual(z)
     except (GapcertError, MemoryError):
         raise
     except Exception as error:  # a third party's system may fail in any way
@@ -146,6 +149,7 @@ class Store:
     where the points are no grid.
 
     `key` is the digest of what determines the answers (model, backend, domain): a folder of another key is refused.
+    `in_calls`: f̂ is asked in calls of many sizes.
     """
 
     folder: Path
@@ -156,6 +160,7 @@ class Store:
     emit: Emit = silent
     digests: dict[str, str] = field(default_factory=dict)
     counts: dict[str, int] = field(default_factory=dict)
+    in_calls: bool = False
 
     def collect(self, name: str, points: PointSet) -> Array:
         """r (n, nx) at all points of round `name`, computing only the shards that are not there yet."""
@@ -231,7 +236,8 @@ class Store:
         payload = pickle.dumps(self.residual)
 
         def task(i: int, start: int, stop: int) -> Task:
-            return Task(i, payload, points, start, stop, start, extremes, _shard(folder, i))
+            calls = self.in_calls and start < 2 * THRESHOLDS.small_calls_rows  # of which half are asked in small calls
+            return Task(i, payload, points, start, stop, start, extremes, _shard(folder, i), calls)
 
         # One chunk is not worth a pool, and a system of the running script cannot be sent to one; the bits are the same.
         if len(todo) <= 1 or b"__main__" in payload:

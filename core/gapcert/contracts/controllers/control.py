@@ -15,7 +15,7 @@ from gapcert.contracts.controllers.goal import Goal
 from gapcert.contracts.controllers.policies import ANYWHERE, Policy
 from gapcert.contracts.gaps.gap import GapFunction
 from gapcert.contracts.plugins.events import Emit, silent
-from gapcert.contracts.systems.domain import Domain
+from gapcert.contracts.systems.domain import Domain, Outside
 from gapcert.contracts.systems.system import Model
 from gapcert.numerics.arrays import Array, Bools, Ints
 
@@ -100,8 +100,8 @@ class Controller(ABC):
         """(n,) booleans: is the state inside the controller's domain?"""
 
     @abstractmethod
-    def act(self, x: Array, policy: Policy, seed: int = 0, k: int = 0) -> Array:
-        """Inputs (n, nu) for states (n, nx) at step k; UsageError outside the domain (never another cell's input)."""
+    def act(self, x: Array, policy: Policy, seed: int = 0, k: int = 0, *, outside: Outside = "raise") -> Array:
+        """Inputs (n, nu) for states (n, nx) at step k; outside the domain (never another cell's input) UsageError, or NaN."""
 
     def start(self, x: Array) -> Ints:
         """Memory (n,) of runs that begin at x; 0 where nothing need be remembered."""

@@ -8,9 +8,9 @@ from typing import Any, Literal, final, get_args
 
 import numpy as np
 
-from gapcert.contracts.systems.domain import Box, Domain
-from gapcert.contracts.systems.region import Region, turned
-from gapcert.contracts.systems.system import StateSpec
+from gapcert.contracts.systems.domain import Box, Domain, turned
+from gapcert.contracts.systems.region import Region
+from gapcert.contracts.systems.system import Model, StateSpec
 from gapcert.numerics.arrays import Array, Bools, Ints
 from gapcert.numerics.errors import UsageError
 
@@ -113,16 +113,21 @@ class Goal:
         for box in self.target.boxes if self.target else ():
             _inside("target", box, "stay", self.stay)
 
-    def check(self, domain: Domain) -> None:
-        """UsageError unless the goal lies inside the domain."""
+    def check(self, domain: Domain, model: Model) -> None:
+        """UsageError unless the goal lies inside the domain, and f repeats along its angles that close on themselves."""
         if self.stay.axes != domain.states.axes:
             names = ", ".join(domain.states.names)
             raise UsageError(f"goal: stay is over {', '.join(self.stay.names)}; expected the model's states {names}")
         _inside("stay", self.stay, "the domain", domain.states)
+        for axis, wraps in zip(self.stay.axes, self.stay.wraps, strict=True):
+            if wraps and (why := model.repeats(axis.name)):
+                what = f"goal: stay closes on itself along {axis.name}, and the model does not repeat there: {why}"
+                raise UsageError(f"{what}; expected a model that does, or a goal over part of the turn")
 
     def holds(self, x: Array) -> Bools:
-        """(n,) booleans: in `stay` and not in `avoid`, for states (n, nx)."""
-        inside = np.asarray(self.stay.contains(turned(self.stay, x)))
+        """(n,) booleans: in `stay` and not in `avoid`, for states (n, nx), on the turn of `stay` as cells are."""
+        x = turned(self.stay, x)
+        inside = self.stay.contains(x)
         return inside if self.avoid is None else inside & ~self.avoid.contains(x)
 
     def reached(self, x: Array) -> Bools:
@@ -131,11 +136,12 @@ class Goal:
 
     def visited(self, x: Array) -> Bools:
         """(n,) booleans: in the target, and the goal holds."""
+        x = turned(self.stay, x)
         return np.zeros(len(x), dtype=bool) if self.target is None else self.target.contains(x) & self.holds(x)
 
     def letter(self, x: Array) -> Ints:
         """(n,): the regions that the states are in, bit p for region p."""
-        out = np.zeros(len(x), dtype=np.int64)
+        x, out = turned(self.stay, x), np.zeros(len(x), dtype=np.int64)
         for p, region in enumerate(self.regions):
             out |= region.contains(x).astype(np.int64) << p
         return out
@@ -166,8 +172,9 @@ class Goal:
 
 
 def _inside(name: str, inner: Box, frame: str, outer: Box) -> None:
-    for axis, a, b, low, high in zip(inner.axes, inner.low, inner.high, outer.low, outer.high, strict=True):
-        if a < low or b > high:
+    for j, (axis, a, b, low, high) in enumerate(zip(inner.axes, inner.low, inner.high, outer.low, outer.high, strict=True)):
+        # Along an axis that closes on itself a target may be anywhere.
+        if (a < low or b > high) and not (name == "target" and outer.wraps[j]):
             raise UsageError(
                 f"goal: {name} asks for {axis.name} in [{a:g}, {b:g}] {axis.unit}, but {frame} is [{low:g}, {high:g}]; "
                 f"narrow the goal or widen {frame}"

@@ -86,6 +86,16 @@ def known_unit(text: str) -> bool:
         return False
 
 
+_COHERENT = re.compile(r"(?:\b(?:1|m|s|kg|rad|A|K|N|J|W|V|C|Hz|Pa)\b|\*\*-?\d|\^-?\d|[*/ ()·])*")  # these need no pint
+
+
+@functools.lru_cache(4096)
+def base(unit: str) -> float:
+    """How many SI base units it is; 1 where that is not known."""
+    plain = _COHERENT.fullmatch(unit) or not known_unit(unit)
+    return 1.0 if plain else float(_registry().Quantity(1.0, unit).to_base_units().magnitude)
+
+
 @functools.cache
 def _registry() -> Any:
     import pint

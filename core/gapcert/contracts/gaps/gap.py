@@ -13,6 +13,7 @@ import numpy as np
 from gapcert.contracts.gaps.lipschitz import LipschitzBound, Symmetry
 from gapcert.contracts.gaps.predictor import Predictor, Samples
 from gapcert.contracts.plugins.events import Emit, silent
+from gapcert.contracts.systems.arithmetic import Arithmetic
 from gapcert.contracts.systems.domain import Domain
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.errors import UsageError
@@ -108,9 +109,9 @@ class GapFunction(ABC):
 @final
 @dataclass(frozen=True)
 class GapProblem:
-    """What a family is fitted to. `lipschitz` bounds g = r − p; `resolution` is e (nx,), of which `rounding` (nx,) is the part
-    of arithmetic where the rest is the spread over hidden states. `emit` takes the progress of a long
-    fit, and `folder` what it may be resumed from.
+    """What a family is fitted to. `lipschitz` bounds g = r − p; `resolution` is e (nx,), of which `arithmetics`, of f̂ and f,
+    are the part of arithmetic where the rest is the spread over hidden states. `emit` takes the progress of a long fit, and
+    `folder` what it may be resumed from.
     """
 
     samples: Samples
@@ -120,15 +121,15 @@ class GapProblem:
     resolution: Array
     route: str
     seed: int = 0
-    rounding: Array | None = None
     symmetry: Symmetry | None = None
+    arithmetics: tuple[Arithmetic, Arithmetic] | None = None
     emit: Emit = silent
     folder: Path | None = None
 
     @property
     def arithmetic(self) -> Array:
         """(nx,): the resolution without the spread over hidden states, against which gaps are judged."""
-        return self.resolution if self.rounding is None else self.rounding
+        return self.resolution if self.arithmetics is None else np.asarray(self.arithmetics[0].e + self.arithmetics[1].e)
 
     @property
     def spread(self) -> bool:

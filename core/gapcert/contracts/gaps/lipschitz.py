@@ -10,6 +10,7 @@ from typing import Any, Literal, final
 import numpy as np
 
 from gapcert.contracts.gaps.predictor import Predictor
+from gapcert.contracts.systems.arithmetic import Arithmetic
 from gapcert.contracts.systems.cells import Cells
 from gapcert.contracts.systems.domain import Domain
 from gapcert.contracts.systems.system import Backend, Model, StateSpec, System, difference
@@ -39,15 +40,12 @@ class Residual:
         return difference(self.model.states, self.backend.step(x, u).x, self.model.step(x, u).x)
 
     def resolution(self, domain: Domain) -> Array:
-        """e (nx,): bound on |computed r − r|, from both arithmetics at the largest |x⁺| of each on Z's corners and centre.
+        """e (nx,): bound on |computed r − r| over Z, from both arithmetics."""
+        return np.asarray(sum(a.e for a in self.arithmetic(domain)))
 
-        Where relations cut a corner off, the last point of Z on the way to it stands in.
-        """
-        corners = np.stack(np.meshgrid(*zip(domain.low, (domain.low + domain.high) / 2, domain.high, strict=True)), axis=-1)
-        z = domain.reach(domain.centre, corners.reshape(-1, len(domain.low)))
-        x, u = domain.split(z)
-        each = (s.resolution(np.abs(s.step(x, u).x).max(axis=0)) for s in (self.backend, self.model))
-        return np.asarray(sum(each))
+    def arithmetic(self, domain: Domain) -> tuple[Arithmetic, Arithmetic]:
+        """Those of f̂ and of f on Z."""
+        return Arithmetic.of(self.backend, domain), Arithmetic.of(self.model, domain)
 
 
 @final
@@ -183,13 +181,14 @@ class LipschitzEstimator(ABC):
 class Symmetry:
     """r(z) = r(z′) for all z, z′ in Z that differ along `axes` (by number) alone: declared, and checked on `pairs` pairs.
 
-    deviation (nx): the largest |r_i(z) − r_i(z′)| that was seen, at most 4 e.
+    deviation (nx): the largest |r_i(z) − r_i(z′)| that was seen, at most 4 e. proved: by the equations of both systems.
     """
 
     names: tuple[str, ...]
     axes: tuple[int, ...]
     pairs: int
     deviation: tuple[float, ...]
+    proved: bool = False
 
     @classmethod
     def checked(cls, names: Sequence[str], problem: LipschitzProblem, pairs: int = THRESHOLDS.symmetry_pairs) -> Symmetry:
@@ -234,14 +233,22 @@ class Symmetry:
     def sentence(self) -> str:
         """What a certificate assumes because of it."""
         what = f"{' and '.join(self.names)} {'are' if len(self.names) > 1 else 'is'} shifted"
+        proof = "interval arithmetic proves it from the equations of both systems" if self.proved else "nothing proves it"
         return (
-            f"The residual does not change when {what}: declared by the user, and checked on "
-            f"{self.pairs} pairs of points of Z, which differed by up to {max(self.deviation):.3g}; the audit does not use it."
+            f"The residual does not change when {what}: declared by the user, and checked on {self.pairs} pairs of points of "
+            f"Z, which differed by up to {max(self.deviation):.3g}; {proof}; the audit does not use it."
         )
+
+    @property
+    def exception(self) -> str:
+        """What is no proof in a sentence that calls constants proved: those that the declaration has replaced."""
+        return "" if self.proved else f", but for those along {' and '.join(self.names)}, which rest on the declared symmetry"
 
     def to_data(self) -> dict[str, Any]:
         """JSON-able."""
-        return {"axes": list(self.axes), "names": list(self.names), "pairs": self.pairs, "deviation": list(self.deviation)}
+        return {"axes": list(self.axes), "names": list(self.names), "pairs": self.pairs, "deviation": list(self.deviation)} | (
+            {"proved": True} if self.proved else {}
+        )
 
 
 def _numbers(names: Sequence[str], domain: Domain) -> list[int]:

@@ -8,6 +8,7 @@ from typing import final
 
 import numpy as np
 
+from gapcert.contracts.systems.arithmetic import Arithmetic
 from gapcert.contracts.systems.domain import Box, Cover, Domain
 from gapcert.contracts.systems.system import Model, StateSpec, difference
 from gapcert.numerics.arrays import Array
@@ -158,9 +159,7 @@ class ModelPredictor(Predictor):
         return self.extended.curvature_enclosure(boxes, axis) - self.nominal.curvature_enclosure(boxes, axis)
 
     def resolution(self, domain: Domain) -> Array:
-        magnitudes = (model.enclosure(domain.interval).mag[0] for model in (self.extended, self.nominal))
-        e = [model.resolution(m) for model, m in zip((self.extended, self.nominal), magnitudes, strict=True)]
-        return np.asarray(e[0] + e[1])
+        return np.asarray(Arithmetic.of(self.extended, domain).e + Arithmetic.of(self.nominal, domain).e)
 
     def arrays(self) -> dict[str, Array]:
         return {}

@@ -6,17 +6,21 @@ import functools
 import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, final
+from typing import Any, Literal, final
 
 import numpy as np
 
 from gapcert.contracts.data.inequality import MalformedError, parse
 from gapcert.contracts.systems.system import StateSpec, System
+from gapcert.numerics import circle
 from gapcert.numerics.arrays import Array, Bools, Ints
 from gapcert.numerics.constraint_zone import Relation as Relation
 from gapcert.numerics.constraint_zone import Zone, centres, grid_at, grid_points, grid_size, lattice
 from gapcert.numerics.errors import UsageError
 from gapcert.numerics.intervals import Interval, norm
+
+Outside = Literal["raise", "nan"]
+"""What an answer is where nothing is known: a UsageError that names the axis and its value, or NaN in that row alone."""
 
 
 @final
@@ -61,14 +65,37 @@ class Box:
         """The box as one Interval of shape (1, axes)."""
         return Interval(np.asarray(self.low)[None], np.asarray(self.high)[None])
 
+    @property
+    def wraps(self) -> tuple[bool, ...]:
+        """Axes that close on themselves: angles over a full turn."""
+        ends = zip(self.axes, self.low, self.high, strict=True)
+        return tuple(axis.kind == "angle" and circle.spans(low, high) for axis, low, high in ends)
+
     def contains(self, points: Array) -> Bools:
         """(n,) booleans: low ≤ point ≤ high on every axis."""
         return np.asarray(((points >= self.low) & (points <= self.high)).all(axis=-1))
+
+    def leaves(self, point: Array) -> str:
+        """Along which axis a point (axes,) lies outside, in words; "" inside."""
+        for axis, value, low, high in zip(self.axes, point.tolist(), self.low, self.high, strict=True):
+            if not low <= value <= high:
+                return f"{axis.name} = {value!r} is outside [{low:g}, {high:g}] {axis.unit}".removesuffix(" 1")
+        return ""
 
     def within(self, other: Box) -> bool:
         return all(a >= b for a, b in zip(self.low, other.low, strict=True)) and all(
             a <= b for a, b in zip(self.high, other.high, strict=True)
         )
+
+
+def turned(box: Box, x: Array) -> Array:
+    """x (…, axes) with every angle on the turn of the box, see `circle.onto`."""
+    for j, axis in enumerate(box.axes):
+        column = x[..., j]
+        if axis.kind == "angle" and (moved := circle.onto(box.low[j], box.high[j], column)) is not column:
+            x = x.copy()
+            x[..., j] = moved
+    return x
 
 
 @final
@@ -161,8 +188,29 @@ class Domain:
         return z[..., : self.nx], z[..., self.nx :]
 
     def contains(self, z: Array) -> Bools:
-        """(n,) booleans: in the box, and every relation holds."""
-        return self.zone.contains(z)
+        """(n,) booleans: in the box, and every relation holds; on the circle along axes that close on themselves."""
+        return self.zone.contains(self.turned(z))
+
+    def turned(self, z: Array) -> Array:
+        """z with the angles that close on themselves on the turn of Z; other angles are numbers here."""
+        wraps = np.array([*self.states.wraps, *(False for _ in self.inputs.axes)])
+        if not wraps.any():
+            return z
+        x, u = self.split(z)
+        return np.where(wraps, np.concatenate([turned(self.states, x), u], axis=-1), z)
+
+    def asked(self, z: Array, outside: Outside) -> Bools:
+        """`contains`, of points at which an answer is wanted; UsageError at the first one outside, unless that is to be NaN."""
+        inside = self.contains(z)
+        if outside == "raise" and not inside.all():
+            row = int(np.argmin(inside))
+            x, u = self.split(z[row])
+            what = self.states.leaves(x) or self.inputs.leaves(u) or f"'{self.zone.broken(z[row])}' does not hold"
+            raise UsageError(
+                f"certificate: row {row}: {what}, and outside of its domain nothing is known of f̂ − f; ask inside, or take "
+                f"outside='nan'"
+            )
+        return inside
 
     def draw(self, n: int, rng: np.random.Generator) -> Array:
         """n independent points, uniform on Z; a pure function of the generator's state."""

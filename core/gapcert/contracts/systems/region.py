@@ -9,29 +9,16 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.contracts.systems.domain import Box
+from gapcert.contracts.systems.domain import Box, turned
 from gapcert.contracts.systems.system import StateSpec
 from gapcert.contracts.thresholds import THRESHOLDS
+from gapcert.numerics import circle
 from gapcert.numerics.arrays import Array, Bools
 from gapcert.numerics.constraint_zone import Relation, Zone
 from gapcert.numerics.errors import UsageError
 from gapcert.numerics.intervals import Interval
 
-TURN = 2 * np.pi
 _ROUND = 1e-12  # relative: an eigenvalue below it may be rounding
-
-
-def turned(box: Box, x: Array) -> Array:
-    """x (n, axes) with every angle outside the box moved by whole turns to the one nearest to the box's centre."""
-    for j, axis in enumerate(box.axes):
-        if axis.kind != "angle":
-            continue
-        column, low, high = x[:, j], box.low[j], box.high[j]
-        out = ((column < low) | (column > high)) & np.isfinite(column)
-        if out.any():
-            x = x.copy()
-            x[out, j] += TURN * np.round(((low + high) / 2 - column[out]) / TURN)
-    return x
 
 
 @final
@@ -245,14 +232,10 @@ def _moved(box: Box, low: Array, high: Array, asked: Callable[[Array, Array], Bo
 
 def _turns(box: Box, low: Array, high: Array) -> Iterator[tuple[Array, Array]]:
     """The cells moved by every number of turns of every angle that may bring them to the box, widened by what that rounds."""
-    ranges = []
-    for j, axis in enumerate(box.axes):
-        if axis.kind != "angle" or not len(low):
-            ranges.append(range(1))
-            continue
-        first, last = (box.low[j] - high[:, j].max()) / TURN, (box.high[j] - low[:, j].min()) / TURN
-        ranges.append(range(int(np.floor(first)), int(np.ceil(last)) + 1))
+    a, b, some = low.min(axis=0, initial=np.inf), high.max(axis=0, initial=-np.inf), len(low) > 0
+    ends = zip(box.axes, a, b, box.low, box.high, strict=True)
+    ranges = [circle.copies(*each) if axis.kind == "angle" and some else range(1) for axis, *each in ends]
     for turns in itertools.product(*ranges):
         t = np.asarray(turns, dtype=np.float64)
-        pad = 4 * np.spacing(np.maximum(np.maximum(np.abs(low), np.abs(high)), TURN)) * np.abs(t)
-        yield low + t * TURN - pad, high + t * TURN + pad
+        pad = 4 * np.spacing(np.maximum(np.maximum(np.abs(low), np.abs(high)), circle.TURN)) * np.abs(t)
+        yield low + t * circle.TURN - pad, high + t * circle.TURN + pad

@@ -13,6 +13,7 @@ import numpy as np
 from gapcert.contracts.systems.extension import Extension as Extension
 from gapcert.contracts.systems.extension import Parameter as Parameter
 from gapcert.contracts.systems.scene import Scene as Scene
+from gapcert.numerics import circle
 from gapcert.numerics.arrays import Array, Bools
 from gapcert.numerics.digest import digest
 from gapcert.numerics.errors import UsageError
@@ -41,10 +42,7 @@ class StateSpec:
         if self.kind == "quaternion":
             return _rotation_vector(a, b)
         d = np.asarray(a - b, dtype=np.float64)
-        if self.kind == "angle":
-            # round(d / 2π) = 0 leaves d untouched, so small differences keep every bit.
-            d = d - 2 * np.pi * np.round(d / (2 * np.pi))
-        return d
+        return circle.near(d) if self.kind == "angle" else d
 
 
 def _rotation_vector(a: Array, b: Array) -> Array:
@@ -123,12 +121,21 @@ class System(ABC):
         """One period from x (n, nx) under u (n, nu); options only as declared in `capabilities`."""
 
     def resolution(self, magnitude: Array) -> Array:
-        """e (nx,): bound on the arithmetic error of one step, by default 4 ulp of `magnitude` = max |x⁺| (nx,)."""
+        """e (nx,): bound on the arithmetic error of one step, by default 4 ulp of `magnitude` = max |x⁺| (nx,).
+
+        It is stated, not proved: claims name it as an assumption. For a Model, see `rounding_over`.
+        """
         return np.asarray(4 * np.spacing(np.maximum(np.abs(magnitude), np.finfo(float).tiny)))
 
     def rounding(self, magnitude: Array) -> Array:
         """The part of `resolution` (nx,) that is arithmetic, without what a solver that iterates may leave (default: all)."""
         return self.resolution(magnitude)
+
+    def repeats(self, angle: str) -> str | None:
+        """Why f(x + 2π, u) = f(x, u) along this state, up to whole turns of angles, is not true (of what is remembered too);
+        empty where it is proved to be, and None where nothing is known: it is probed then.
+        """
+        return None
 
     def scene(self, x: Array, hidden: Array | None = None) -> Scene | None:
         """What x (n, nx) looks like, with hidden (n, nh) or its default; None without a body, or where x does not say."""
@@ -396,6 +403,15 @@ class Model(System, Extendable, EngineHints):
     def curvature_enclosure(self, z: Interval, axis: int) -> Interval:
         """Contains {∂²f/∂z_axis² : z ∈ box}, shape (n, nx), rounded outwards; [−∞, ∞] where a slope may jump, or by default."""
         return Interval(np.full((len(z), self.nx), -np.inf), np.full((len(z), self.nx), np.inf))
+
+    def rounding_over(self, z: Interval) -> Array | None:
+        """(n, nx): proved bound on |computed x⁺ − x⁺| over each box, intermediate results included, whatever evaluates the
+        step and in whatever batch; ∞ where nothing bounds it. None (default): `resolution` is what is assumed."""
+        return None
+
+    def rounding_terms(self, z: Interval) -> tuple[str, ...]:
+        """Per state, the term whose rounding has the largest share in that bound, over all of the boxes."""
+        return ("",) * self.nx
 
     def output(self, x: Array, u: Array, parameters: Values | None = None) -> Array:
         """y = h(x, u), shape (n, ny); by default the state itself."""

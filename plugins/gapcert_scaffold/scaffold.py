@@ -19,10 +19,7 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import final
 
-from gapcert.contracts.plugins.registry import installed
-from gapcert.numerics.errors import UsageError
-from gapcert.spec.check import COMPONENTS
-from gapcert.spec.sections.sections import SECTIONS
+from gapcert.plugin import COMPONENTS, SECTIONS, Answer, Arguments, UsageError, installed
 
 _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 _LONGEST = 30  # characters of a name; chosen, not measured
@@ -151,7 +148,7 @@ def _free(kind: str, name: str, distribution: str, package: str) -> None:
 
 
 def _templates() -> Traversable:
-    return files("gapcert.cli.scaffold") / "templates"
+    return files(__package__) / "templates"
 
 
 def _read(folder: Traversable, at: str = "") -> Iterator[tuple[str, str]]:
@@ -167,13 +164,13 @@ def _filled(text: str, words: Mapping[str, str]) -> str:
     return re.sub(r"@(\w+)@", lambda hit: words[hit[1]], text)
 
 
-def new(kind: str, name: str, out: Path | None) -> tuple[dict[str, object], list[str]]:
-    """Write a new distribution into `out` (default: a folder of its name here); what was done, as data and in words."""
-    made = scaffold(kind, name)
-    folder = Path(made.distribution) if out is None else out
+def command(options: Arguments) -> Answer:
+    """Writes a new distribution (default: into a folder of its name here); what was done, as data and in words."""
+    made = scaffold(options.kind, options.name)
+    folder = Path(made.distribution) if options.out is None else options.out
     paths = [str(p) for p in made.write(folder)]
     shown = os.fspath(folder)
     steps = [f"cd {shown}", "pip install -e '.[test]'", "pytest"]
-    facts: dict[str, object] = {"kind": kind, "name": name, "distribution": made.distribution, "package": made.package}
+    facts = {"kind": made.kind, "name": made.name, "distribution": made.distribution, "package": made.package}
     words = [*paths, "", "next:", *(f"  {s}" for s in steps), f"then read {folder / 'README.md'}"]
-    return {**facts, "folder": shown, "files": paths, "next": steps}, words
+    return Answer({**facts, "folder": shown, "files": paths, "next": steps}, words)

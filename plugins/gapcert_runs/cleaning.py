@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import final
 
-from gapcert.numerics.errors import UsageError
-from gapcert.run.folder import LOCK, MARK, is_run, owned
-from gapcert.run.status import RunFolder, walk
+from gapcert.plugin import LOCK, MARK, Answer, Arguments, GapcertError, RunFolder, UsageError, is_run, owned, times, walk
+
+from . import listing
 
 LEDGER = "ledger.json"
 _AGES = {"s": 1, "min": 60, "h": 3600, "d": 86400, "w": 604800}
@@ -112,3 +112,37 @@ def _amount(text: str, units: dict[str, float] | dict[str, int], option: str, ex
     if match is None or match[2] not in units:
         raise UsageError(f"{option}: found '{text}'; expected a number and one of {', '.join(units)}, such as {example}")
     return float(match[1]) * units[match[2]]
+
+
+def command(options: Arguments) -> Answer:
+    asked = (options.name, options.state, options.older_than, options.larger_than, options.keep_last, options.all)
+    if not any(asked):
+        raise UsageError(
+            "gapcert runs clean: nothing says which folders; give --state, --name, --older-than, --larger-than, --keep-last "
+            "or --all"
+        )
+    if options.keep_last < 0:
+        raise UsageError(f"--keep-last: found {options.keep_last}; expected a number from 0 on")
+    older = None if options.older_than is None else seconds(options.older_than)
+    larger = None if options.larger_than is None else size(options.larger_than)
+    choice = Choice(older, larger, options.keep_last)
+    goes, stays = choice.of(listing.chosen(options.out, options.name, options.state, options.sort))
+    rows, failed = [listing.entry(r) for r in goes], list[dict[str, str]]()
+    if options.yes:
+        for run in goes:
+            try:
+                remove(run)
+            except GapcertError as error:
+                failed.append({"run_dir": str(run.path), "reason": str(error)})
+    lost = {f["run_dir"] for f in failed}
+    gone = [r for r in rows if r["run_dir"] not in lost]
+    total = sum(r["size_bytes"] for r in gone)
+    kept = [{"run_dir": str(r.path), "reason": why} for r, why in stays] + failed
+    data = {"removed": options.yes, "folders": gone, "size_bytes": total, "kept": kept}
+    verb = "removed" if options.yes else "would go"
+    words = [f"{verb}: {r['run_dir']} ({listing.condition(r)}, {listing.sized(r['size_bytes'])})" for r in gone]
+    words += [f"stays: {k['run_dir']}: {k['reason']}" for k in kept]
+    words += [
+        f"{times(len(gone), 'folder')}, {listing.sized(total)}" + ("" if options.yes or not gone else "; --yes removes them")
+    ]
+    return Answer(data, words, UsageError.exit_code if failed else 0)

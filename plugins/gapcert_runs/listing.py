@@ -8,9 +8,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
-from gapcert.numerics.texts import columns
-from gapcert.run.progress_rate import duration, figure
-from gapcert.run.status import RunFolder, folders
+from gapcert.plugin import Answer, Arguments, RunFolder, columns, duration, figure, folders
 
 ORDERS: dict[str, Callable[[RunFolder], Any]] = {
     "age": lambda r: -r.changed,
@@ -123,3 +121,9 @@ def _certified(certificate: Mapping[str, Any]) -> Iterator[str]:
         yield f"γ {tight[worst]:.3f} × the gap" + (f" of {worst}" if len(tight) > 1 else "")
     elif largest := {n: s["gamma_max"] for n, s in states if s.get("gamma_max") is not None}:
         yield "γ ≤ " + ", ".join(f"{figure(v)} for {n}" for n, v in largest.items())
+
+
+def command(options: Arguments) -> Answer:
+    rows = [entry(r) for r in chosen(options.out, options.name, options.state, options.sort)]
+    none = f"no run folders in {options.out}" + (" that match" if options.name or options.state else "")
+    return Answer(rows, table(rows) if rows else [none])

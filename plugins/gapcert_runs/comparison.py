@@ -9,7 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, final
 
-from gapcert.plugin import Answer, Arguments, RunFolder, UsageError, columns, entry, figure, leaves, stored
+from gapcert.plugin import Answer, Arguments, RunFolder, UsageError, columns, figure, leaves, stored
+
+from .listing import entry
 
 Change = Literal["same", "noise", "changed"]
 EXACT = 1e-9  # relative: figures without noise differ by rounding at most

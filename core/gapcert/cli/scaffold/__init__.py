@@ -1,1 +1,0 @@
-"""A new plugin as a distribution of its own."""
