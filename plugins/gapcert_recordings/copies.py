@@ -153,12 +153,21 @@ class _Series:
 
 
 def _step(v: Array) -> float:
-    """The step of a lattice on which values (n,) lie, as counts do; 0 where they lie on none."""
-    unique = np.unique(v)
-    apart = np.diff(unique)
-    apart = apart[apart > 1e-9 * np.ptp(unique)] if len(apart) else apart
-    counts = apart / apart.min(initial=np.inf)
-    return float(apart.min()) if len(apart) and (np.abs(counts - np.round(counts)) < 1e-3).all() else 0.0
+    """The step of a lattice on which values (n,) lie, as counts do, by Euclid's algorithm; 0 where they lie on none."""
+    gaps = np.diff(np.unique(v))
+    gaps = gaps[gaps > 1e-9 * gaps.sum()]
+    left = gaps
+    while len(left) and (step := float(left.min())) > 1e-9 * gaps.sum():
+        # What is written with few digits knows a step from many of them.
+        for most in (1, 5, 50, np.inf):
+            counts = np.round(gaps / step)
+            few = (counts > 0) & (counts <= most) & (np.abs(gaps - step * counts) < 0.05 * step)
+            step = float(gaps[few] @ counts[few] / (counts[few] @ counts[few])) if few.any() else step
+        left = np.abs(gaps - step * np.round(gaps / step))
+        left = left[left > 1e-3 * step]
+        if not len(left):
+            return step
+    return 0.0
 
 
 def _form(v: Array) -> tuple[int, int, bool]:
