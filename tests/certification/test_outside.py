@@ -81,6 +81,27 @@ def test_rows_outside_are_nan_and_named_and_the_others_as_if_asked_alone(seed: i
                 ask(x, u)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_an_angle_over_a_full_turn_is_asked_on_its_turn_and_a_narrower_one_is_a_number(seed: int) -> None:
+    """From −20 to 20 turns on, at both ends of the turn and beside them by an ulp: nothing is outside of it."""
+    rng, axes = np.random.default_rng(seed), (gc.StateSpec("theta", "rad", "angle"), gc.StateSpec("w", "rad/s"))
+    low = float(rng.uniform(-4, 1))
+    ends = (low, low + 2 * np.pi), (low, low + 3.0)
+    inputs = gc.Box((gc.StateSpec("u0", "1"), gc.StateSpec("u1", "1")), (-1.0, -1.0), (1.0, 1.0))
+    whole, part = (gc.Domain(gc.Box(axes, (a, -2.0), (b, 2.0)), inputs) for a, b in ends)
+    own = np.concatenate([rng.uniform(*ends[0], 40), np.nextafter(ends[0], np.inf), np.nextafter(ends[0], -np.inf), ends[0]])
+    turns = rng.integers(-20, 21, len(own))
+    x, u = np.stack([own + 2 * np.pi * turns, rng.uniform(-2, 2, len(own))], axis=1), rng.uniform(-1, 1, (len(own), 2))
+    on = whole.turned(np.hstack([x, u]))
+    assert whole.zone.contains(on).all()
+    low_, high_ = Declaration(Slope(), Drift(2), whole).interval(x, u)
+    assert np.array_equal(np.stack([low_, high_]), np.stack(Slope().interval(on)))
+    lost = np.isnan(Declaration(Slope(), Drift(2), part).gamma(x, u, outside="nan")).any(axis=1)
+    assert np.array_equal(lost, ~((x[:, 0] >= ends[1][0]) & (x[:, 0] <= ends[1][1])))
+    with pytest.raises(gc.UsageError, match=r"w = 2.5 is outside \[-2, 2\] rad/s"):
+        Declaration(Slope(), Drift(2), whole).gamma([low + 40.0, 2.5], [0.0, 0.0])
+
+
 @pytest.mark.run
 def test_one_point_is_asked_as_rows_are_and_a_stored_certificate_answers_the_same(tmp_path: Path) -> None:
     model = {"kind": "equations", "states": {"v": "1"}, "inputs": {"u": "1"}, "period": "0.1 s"}

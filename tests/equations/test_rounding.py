@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rounded_models import DIGITS, Draw, missed
+from rounded_models import DIGITS, Draw, equations_model, missed
 
 import gapcert as gc
 from gapcert import Interval
 from gapcert_equations.config import EquationsConfig
-from gapcert_equations.model import EquationsModel
 from gapcert_equations.programs import rounding
 
 CANCELLING = "0.3*p + 0.2*sin(7*p) + (max(3*p/7 + 4e9, -2) - max(4e9 - p/7, -1e20))"
@@ -26,7 +25,7 @@ STIFF = {
 
 
 def made(**given):
-    return EquationsModel(EquationsConfig(kind="equations", **given))
+    return equations_model(EquationsConfig(kind="equations", **given))
 
 
 def mapped(text, **more):
@@ -124,7 +123,7 @@ def test_the_term_that_cancels_is_named():
 @pytest.mark.parametrize("scheme", ["euler", "semi_implicit", "rk4"])
 def test_errors_shrink_where_the_motion_contracts(scheme):
     """v forgets what it was: forty sub-steps err by no more than a few."""
-    model = EquationsModel(EquationsConfig(**STIFF | {"integrator": scheme}))
+    model = equations_model(EquationsConfig(**STIFF | {"integrator": scheme}))
     bound = model.rounding_over(box([-1, -1, -1], [1, 1, 1]))[0]
     assert (bound < 64 * np.spacing(2.0)).all()
     rng = np.random.default_rng(3)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from rounded_models import equations_model
 
 import gapcert as gc
 from gapcert.certification.coordinates import Coordinates, RelativeModel
 from gapcert.contracts.systems.arithmetic import Arithmetic
 from gapcert_bounds.constants.interval import IntervalJacobian
 from gapcert_equations.config import EquationsConfig
-from gapcert_equations.model import EquationsModel
 from gapcert_verify.verify import verify_run
 
 # f̂ of each differs from f = 0.4 p + 0.2 u by what is added here; ranges of p.
@@ -24,7 +24,7 @@ TEXTS = {
 
 def model(text="0"):
     law = f"0.4*p + 0.2*u + {text}"
-    return EquationsModel(EquationsConfig(kind="equations", states={"p": "1"}, inputs={"u": "1"}, next={"p": law}, period=0.1))
+    return equations_model(EquationsConfig(kind="equations", states={"p": "1"}, inputs={"u": "1"}, next={"p": law}, period=0.1))
 
 
 def certified(folder, name, **options):
@@ -64,7 +64,7 @@ def test_points_next_to_samples_stay_in_the_band(tmp_path, name):
 @pytest.mark.parametrize("name", ["offset", "wave"])
 def test_with_four_ulp_of_the_state_they_do_not(tmp_path, monkeypatch, name):
     """And then e is told as an assumption."""
-    monkeypatch.setattr(EquationsModel, "rounding_over", lambda self, z: None)
+    monkeypatch.setattr("gapcert_equations.model.EquationsModel.rounding_over", lambda self, z: None)
     c = certified(tmp_path, name)
     assert outside(c, near(c, 20_000), TEXTS[name][0]) > 100
     assert sum("of both it is assumed as it is stated, not proved" in a for a in c.assumptions) == 1

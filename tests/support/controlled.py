@@ -291,6 +291,10 @@ BANDS = {
         "gap": {"kind": "basis", "functions": ["1", "abs(h)", "v^2", "abs(a)"]},
         "sampling": {"kind": "grid", "counts": {"h": 6, "v": 6, "a": 6}},
     },
+    "lifted": {
+        "gap": {"kind": "basis", "functions": ["1", "abs(a)"]},
+        "certificate": {"claim": "deterministic", "route": "dominate", "violation": 0.05, "confidence": 0.9},
+    },
     "slopes": {"gap": {"kind": "envelope", "predictor": "multilinear"}},
     "calibrated": {
         "gap": {"kind": "envelope", "predictor": "affine"},

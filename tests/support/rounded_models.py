@@ -9,7 +9,13 @@ import numpy as np
 
 from gapcert import UsageError
 from gapcert_equations.config import EquationsConfig
-from gapcert_equations.model import EquationsModel
+
+
+def equations_model(config):
+    """Imported late: it brings computer algebra, which collecting tests has no use for."""
+    from gapcert_equations.model import EquationsModel
+
+    return EquationsModel(config)
 
 
 def _sign(v):
@@ -99,7 +105,7 @@ class Draw:
         kind, depth = r.choice(["next", "derivative", "mechanical"]), int(r.integers(1, 5))
         given |= getattr(self, f"_{kind}")(states, [*states, *inputs, "a", "b"], depth)
         try:
-            model = EquationsModel(EquationsConfig(**given))
+            model = equations_model(EquationsConfig(**given))
         except UsageError:
             return None, None, None
         nz = model.nx + model.nu

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import sympy
 
 import gapcert as gc
 from gapcert.certification.fingerprint import Fingerprint
@@ -130,6 +129,7 @@ def in_other_units(spec: Spec, rng: Draws) -> None:
 
 def rewritten(spec: Spec, rng: Draws) -> None:
     """By computer algebra, or by hand: the same numbers but for their last bits."""
+    import sympy
 
     def changed(text: str) -> str:
         names = {n: sympy.Symbol(n, real=True) for n in (*spec["model"]["states"], *spec["model"]["inputs"], "spare")}

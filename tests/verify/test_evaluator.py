@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from rounded_models import equations_model
 
 from gapcert import Interval, UsageError
 from gapcert_equations.config import EquationsConfig
-from gapcert_equations.model import EquationsModel
 from gapcert_equations.text import grammar
 from gapcert_verify import arithmetic, evaluator
 from gapcert_verify.evaluator import Equations, NotText, quantity
@@ -94,7 +94,7 @@ def test_it_knows_the_functions_of_the_grammar():
 @pytest.mark.parametrize("name", MODELS)
 def test_steps_of_models_stay_inside(name):
     section = {"kind": "equations", **MODELS[name]}
-    model, q = EquationsModel(EquationsConfig.model_validate(section)), Equations.of(section)
+    model, q = equations_model(EquationsConfig.model_validate(section)), Equations.of(section)
     assert q.states == tuple(s.name for s in model.states)
     left, wide = reached(model, q, np.random.default_rng(len(name)), 0.2, size=1.0)
     assert left == 0
@@ -110,7 +110,7 @@ def written(text):
         "period": "1 s",
     }
     try:
-        return EquationsModel(EquationsConfig.model_validate(section)), Equations.of(section)
+        return equations_model(EquationsConfig.model_validate(section)), Equations.of(section)
     except UsageError:  # it simplifies to what is no number
         return None
 

@@ -206,8 +206,8 @@ class Statement(ABC):
         Where (x, u) is not in Z, nothing is known: UsageError that names the axis and its value, or with `outside="nan"` a row
         of NaN.
         """
-        z = np.concatenate([np.atleast_2d(np.asarray(v, dtype=float)) for v in (x, u)], axis=1)
         domain, band = self._about()
+        z = domain.turned(np.concatenate([np.atleast_2d(np.asarray(v, dtype=float)) for v in (x, u)], axis=1))
         inside = domain.asked(z, outside)
         both = np.full((2, len(z), domain.nx), np.nan)
         if inside.any():

@@ -9,7 +9,7 @@ from typing import final
 
 import numpy as np
 
-from gapcert.plugin import Array, Interval, UsageError, ranges, rounding
+from gapcert.plugin import Array, Interval, UsageError, cut, joined, ranges, rounding
 from gapcert_verify import arithmetic as ar
 from gapcert_verify.evaluator import Equations, Reader, Tape
 from gapcert_verify.evidence import Evidence, Part, bounds, factor, written
@@ -220,28 +220,19 @@ def _of_basis(e: Evidence, boxes: Interval) -> Array:
 
 
 def _dominating(e: Evidence, boxes: Interval) -> Interval:
-    """Both sides with the largest shift of the table's cells that a box touches."""
+    """Both sides with their shifts, over the parts of a box that lie in the table's cells; a face is the lower cell's."""
     from gapcert_verify.functions import sides, table
 
     own, (lower, upper) = table(e.arrays, e.zone), sides(e.data["form"], e.arrays, e.zone)
-    counts, columns = [len(edges) - 1 for edges in own.edges], list(enumerate(own.edges))
-    # A point on an edge may belong to either side of it.
-    first = np.stack([np.searchsorted(edges, boxes.lo[:, j], "left") - 1 for j, edges in columns], axis=1)
-    last = np.stack([np.searchsorted(edges, boxes.hi[:, j], "right") - 1 for j, edges in columns], axis=1)
-    first, last = (np.clip(i, 0, np.array(counts) - 1) for i in (first, last))
-    grid = e.arrays["gap.shifts"].reshape(2, -1, *counts)
+    starts, parts, first, last = cut(own.edges, boxes, own.at(boxes.lo), own.at(boxes.hi))
+    grid = e.arrays["gap.shifts"].reshape(2, -1, *own.counts)
     spans, same = np.unique(np.hstack([first, last]), axis=0, return_inverse=True)
-    most = np.stack(
-        [
-            grid[(slice(None), slice(None), *(slice(a, b + 1) for a, b in s.reshape(2, -1).T))].max(
-                axis=tuple(range(2, grid.ndim))
-            )
-            for s in spans
-        ],
-        axis=0,
-    )[same.reshape(-1)]
-    low, high = lower.tight_over(boxes) - most[:, 0], upper.tight_over(boxes) + most[:, 1]
-    return Interval.hull(low, high)
+    inner, most = tuple(range(2, grid.ndim)), np.empty((len(spans), 2, grid.shape[1]))
+    for row, ends in zip(most, spans.reshape(len(spans), 2, -1), strict=True):
+        row[:] = grid[(slice(None), slice(None), *(slice(a, b + 1) for a, b in ends.T))].max(axis=inner)
+    shift = most[same.reshape(-1)]
+    low, high = lower.tight_over(parts) - shift[:, 0], upper.tight_over(parts) + shift[:, 1]
+    return joined(starts, Interval.hull(low, high))
 
 
 def _interpolated(e: Evidence, boxes: Interval) -> Interval:
