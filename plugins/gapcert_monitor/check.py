@@ -174,8 +174,8 @@ class Check:
     `listed` largest excesses in the order of time; `violated` counts the transitions. rate = violated / points; rate_limit:
     its upper limit at 95 % (Clopper–Pearson), if transitions were independent. The verdict is `violated` where the claim is
     refuted: more of its `units` (transitions, or windows) have a violation than are `allowed`, see `tolerated`. drift: per
-    state, the change of r at a given z from the beginning to the end of the log, see `drift`. copies: trajectories, or rows,
-    that are in the log twice, and count once. `hint`: what to do next.
+    state, the change of r at a given z from the beginning to the end of the log, see `drift`. copies: what is in the log twice,
+    and counts once. `hint`: what to do next.
     """
 
     verdict: Literal["holds", "violated", "outside"]
@@ -188,15 +188,15 @@ class Check:
     rate: float | None
     rate_limit: float | None
     drift: Mapping[str, Mapping[str, Any] | None]
+    copies: Copies
     noise: Mapping[str, float] = field(default_factory=dict)
     hint: str = ""
     units: int = 0
     allowed: int = 0
-    copies: tuple[str, ...] = ()
 
     def summary(self) -> dict[str, Any]:
         """The JSON contract of `gapcert check`."""
-        lists = {"violations": list(self.violations), "copies": list(self.copies)}
+        lists = {"violations": list(self.violations), "copies": self.copies.summary()}
         return {**vars(self), **lists, "drift": dict(self.drift), "noise": dict(self.noise)}
 
 
@@ -245,10 +245,10 @@ def check(certified: Certified, recording: Recording, noise: Mapping[str, float]
         k / n if n else None,
         rate_limit(k, n) if n else None,
         drift,
+        copies,
         stated,
         units=units,
         allowed=most,
-        copies=copies.told,
     )
     return replace(made, hint=_hint(made, _noisy(steps, unknown, inside, model)))
 
@@ -367,7 +367,7 @@ def in_words(found: Check) -> list[str]:
     worst = sorted(found.violations, key=lambda v: -v["size"] / max(v["gamma"], 1e-300))[:5]
     lines += [f"  t = {v['t']:.6g} s: |r| of {v['state']} is {v['size']:.4g}, γ is {v['gamma']:.4g}" for v in worst]
     trends = {n: d for n, d in found.drift.items() if d is not None and d["trend"]}
-    lines += [f"  counted once: {copy}" for copy in found.copies]
+    lines += [f"  {found.copies.told}"] if found.copies.found else []
     lines += [f"  {n} drifts by {d['change']:.3g} (± {d['error']:.2g}) along the log" for n, d in trends.items()]
     return [*lines, *([found.hint] if found.hint else [])]
 

@@ -10,7 +10,7 @@ import pytest
 import gapcert as gc
 from gapcert.cli.main import main
 from gapcert.testing.toys import Drift, Perturbed, ripple, ripple_lipschitz
-from gapcert_monitor.check import check, rate_limit, tolerated
+from gapcert_monitor.check import check, in_words, rate_limit, tolerated
 from gapcert_recordings.transitions import Transitions
 
 RANGES = {"x0": (-1.0, 1.0), "u0": (-2.0, 2.0)}
@@ -242,7 +242,9 @@ def test_a_log_that_is_given_twice_counts_once(certificate):
     again = gc.Trajectory(t + 50, {"x0": np.round(x, 6), "u0": np.round(u, 6)}, "later")
     found = certificate.check(gc.Recording((tr, again)))
     assert found.points == certificate.check(recording(t, x, u)).points
-    assert found.copies == ("'later' is a copy of '0'",)
+    assert found.copies.told == "1 of 2 trajectories is a copy and counts once: 'later' is a copy of '0'"
+    assert [(c["name"], c["of"], c["whole"]) for c in found.summary()["copies"]] == [("later", "0", True)]
+    assert f"  {found.copies.told}" in in_words(found)
 
 
 def test_one_step_of_the_monitor_is_the_certificate_at_that_point(certificate):
