@@ -30,9 +30,10 @@ from gapcert.plugin import (
     stated_units,
     without_units,
 )
+from gapcert_bounds import calibrated, stored
 from gapcert_monitor.thresholds import THRESHOLDS
 from gapcert_recordings import Copies, Transitions, axes
-from gapcert_verify import Evidence, bounds, load, zone
+from gapcert_verify import Evidence, bounds, load
 
 from .drift import drift as _drift
 
@@ -124,9 +125,12 @@ class Certified(Statement):
                 (extended, model) if relative is None else (RelativeModel(extended, relative), RelativeModel(model, relative))
             )
             p = ModelPredictor(*pair)
+        band, middle = _stored_band(evidence, p), np.add(evidence.zone.low, evidence.zone.high)[None] / 2
+        if (found := band(middle)[0].shape) != (1, model.nx):
+            raise ValueError(f"the band has the shape {found} at a point; expected one value for each of {model.nx} states")
         claim, window = Claim(**evidence.data["claim"]), (data.get("certificate") or {}).get("window")
         length = None if window is None else magnitude(window, "s")
-        return cls(model, zone(evidence.data), _stored_band(evidence, p), relative, claim, length)
+        return cls(model, evidence.zone, band, relative, claim, length)
 
     def points(self, x: Array, u: Array) -> Array:
         """z (n, nz) in the coordinates of Z; angles on the turn of Z."""
@@ -157,6 +161,14 @@ def _stored(folder: Path, name: str) -> dict[str, Any]:
 
 
 def _stored_band(evidence: Evidence, p: Predictor | None) -> Band:
+    """As the certificate computes it, where its gap function can be made again; else by intervals around it."""
+    own = {k.removeprefix("gap."): v for k, v in evidence.arrays.items() if k.startswith("gap.")}
+    made = stored(evidence.data["form"], own, evidence.zone, p)
+    if made is not None and "calibrated.widening" not in own:
+        return made.interval
+    if made is not None:
+        return lambda z: calibrated(*made.interval(z), own["calibrated.widening"], own["calibrated.resolution"])
+
     def band(z: Array) -> tuple[Array, Array]:
         e = evidence if p is None else replace(evidence, arrays={**evidence.arrays, "predictor.check": p(z)})
         low, high = bounds(e, z, "predictor.check")
