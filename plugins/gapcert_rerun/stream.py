@@ -85,6 +85,7 @@ class Stream:
             self.recording.log("log", rr.TextLog(str(event.data.get("message", "")), level=rr.TextLogLevel.WARN))
             self.recording.reset_time()
         if (draw := DRAWN.get(type(figure := event.data.get("figure")))) is not None:
+            self.canvas.refuted = event.data.get("refuted", False)
             draw(self.canvas, figure)
         if "markdown" in event.data:
             # What the pictures mean follows the answer: a panel shows as much of it as there is room for.
