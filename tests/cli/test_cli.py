@@ -311,7 +311,7 @@ def test_verify_returns_its_verdict(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr("gapcert_verify.verify_run", lambda folder, *how: {"verdict": "fails", "checks": checks})
     assert main(["verify", str(tmp_path)]) == 1
     assert "FAILED  audit  3 points outside" in capsys.readouterr().out
-    monkeypatch.setattr("gapcert_verify.verify_run", lambda folder: {"verdict": "holds", "checks": []})
+    monkeypatch.setattr("gapcert_verify.verify_run", lambda folder, *how: {"verdict": "holds", "checks": []})
     assert main(["verify", str(tmp_path), "--json"]) == 0
     assert one_object(capsys.readouterr().out)["verdict"] == "holds"
 
