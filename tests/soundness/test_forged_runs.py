@@ -127,8 +127,8 @@ def forged(source: Path, place: Path, seed: int, count: int) -> list[str]:
     return [text for text in found if text]
 
 
-@pytest.mark.exam
-@pytest.mark.parametrize("kind", ["statistical", "controller"])
+@pytest.mark.contract
+@pytest.mark.parametrize("kind", ["statistical", "declared"])
 def test_a_few_forgeries_are_caught(runs, out, tmp_path, kind):
     assert forged(run_of(runs, kind, out), tmp_path, 3, 6) == []
 
@@ -203,6 +203,7 @@ def test_a_forgery_is_told(runs, out, tmp_path, name):
     assert any(why in text for text in failed) if why else failed == [], failed
 
 
+@pytest.mark.contract
 def test_what_is_trusted_is_short(runs, out):
     trusted = verify_run(run_of(runs, "statistical", out))["trusted"]
     assert [text.partition(" ")[0] for text in trusted] == ["Versions,", "How", "The", "The"]
