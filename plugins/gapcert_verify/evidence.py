@@ -53,6 +53,11 @@ class Evidence:
         rows = extremes(self.data, header["extremes"], z, r)
         return z[rows], np.ascontiguousarray(r["r"][rows])
 
+    @property
+    def older(self) -> bool:
+        """Was it written before format 2, so that it holds less than its sentences say?"""
+        return "format" not in self.data
+
     @cached_property
     def taken(self) -> int:
         """Transitions behind the bound, stored or not."""

@@ -27,7 +27,7 @@ from .evidence import Evidence, Part, another, bounds, distance, load, predictor
 from .margin import margin
 from .proofs import bent, dominates, exceeds, follows
 from .run_folder.origin import CHECKS as ORIGIN
-from .run_folder.origin import Check, Origin, origin
+from .run_folder.origin import Check, Origin, arithmetic, gates, origin, shifted
 from .run_folder.origin import again as again_of
 from .run_folder.pictures import figures, page
 from .run_folder.summary import root, summary, whole_run
@@ -47,6 +47,8 @@ FOLDER: tuple[tuple[str, Check], ...] = (
     ("pictures show what is stored", figures),
     ("the page is that of summary and figures", page),
 )
+LATER = (arithmetic, gates, shifted, figures, page)
+"""What a certificate of before format 2 has no data for, or said in other words: it is told as trusted there."""
 CLAIMS = ("deterministic", "statistical", "empirical", "assumed")
 PROVENANCES = ("analytic", "interval", "declared", "estimated")
 UNIFORM = "uniform on X × U"
@@ -91,8 +93,8 @@ def verify_run(folder: Path | str, emit: Emit = silent, *, allow_code: bool = Fa
         ]
     checks += [
         ("constants come from what they are said to come from", _method),
-        ("assumptions are those that the data give", sentences.assumptions),
-        ("warnings are those that gates and estimators give", sentences.warnings),
+        ("assumptions are those that the data give", _since(sentences.assumptions)),
+        ("warnings are those that gates and estimators give", _since(sentences.warnings)),
     ]
     source = _whence(evidence, allow_code, bool(again))
     checks += [
@@ -144,6 +146,7 @@ def _trusted(e: Evidence, source: Origin | str | UsageError) -> list[str]:
     told: list[tuple[str, Any]] = [
         (f"Model, domain, names and what was asked are as stated: {source}.", not isinstance(source, Origin)),
         ("Versions, times, and budgets of the spec that only a new run could tell are as stated.", True),
+        ("It is of before format 2: its sentences, e, hidden state, answer, pictures and page are as stated.", e.older),
     ]
     whole = isinstance(source, Origin) and source.text
     if _bare(e):
@@ -218,7 +221,12 @@ def _specified(source: Origin | str | UsageError, e: Evidence) -> str | None:
 
 def _asked(check: Check, source: Any, e: Evidence) -> str | None:
     """A check against the spec, where there is one."""
-    return check(e, source) if isinstance(source, Origin) else None
+    return check(e, source) if isinstance(source, Origin) and not (e.older and check in LATER) else None
+
+
+def _since(check: Callable[[Evidence], str | None]) -> Callable[[Evidence], str | None]:
+    """A check of what format 2 has the data for."""
+    return lambda e: None if e.older else check(e)
 
 
 def _attempt(check: Callable[[Evidence], str | None], evidence: Evidence) -> str | None:

@@ -228,6 +228,10 @@ class Statement(ABC):
         return gapcert.Monitor(gapcert.Certified.of(self))
 
 
+FORMAT = 2
+"""Of what `save` writes: 1, which was not told, had no units and no period beside Z."""
+
+
 class SavedStatement(Statement, Shown):
     """One that holds its gap function: it is shown, and saved."""
 
@@ -244,6 +248,7 @@ class SavedStatement(Statement, Shown):
         content = npz_bytes({**{f"gap.{k}": v for k, v in self.gap.arrays().items()}, **arrays})
         data = {
             **self.summary(),
+            "format": FORMAT,
             "form": dict(self.gap.form),
             "predictor": predictor,
             "domain": domain_data(self._about()[0], self.model),

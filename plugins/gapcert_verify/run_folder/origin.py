@@ -160,9 +160,11 @@ def question(e: Evidence, o: Origin) -> str:
     """ "" where names, units, ranges, period, seed, family, route and level are those that the spec asks for."""
     a, data = o.asked, e.data
     made = json.loads(json.dumps(domain_data(o.domain, o.model)))
-    if made != data["domain"]:
-        other = next(k for k in {**made, **data["domain"]} if made.get(k) != data["domain"].get(k))
-        return f"domain: {other} is stated as {data['domain'].get(other)}, and the spec gives {made.get(other)}"
+    stated = {"relations": [], **data["domain"]}
+    made = {k: v for k, v in made.items() if k in stated} if e.older else made
+    if made != stated:
+        other = next(k for k in {**made, **stated} if made.get(k) != stated.get(k))
+        return f"domain: {other} is stated as {stated.get(other)}, and the spec gives {made.get(other)}"
     recording, bare = "recording" in data, "audit" not in data and "recording" not in data
     asked = {"seed": a["seed"]} if not bare else {}
     asked |= {"family": a["family"].name, "route": "calibrate" if recording else "declared" if bare else o.route}
@@ -298,10 +300,12 @@ def stepped(e: Evidence, o: Origin) -> str | None:
     """Every stored residual is that of f̂ and f, to within 2 e, and e that of their arithmetic; both are stepped again."""
     if not o.text or "audit" not in e.data:
         return None
+    # What e was taken for before format 2 is less than the arithmetic may err by.
+    room = np.maximum(e.rounding, o.residual.resolution(o.domain)) if e.older else e.rounding
     for name, z, r in (*_rounds(e), *_further(e)):
-        if text := _apart(o, z, r, 2 * e.rounding, name):
+        if text := _apart(o, z, r, 2 * room, name):
             return text
-    return _keyed(e, o)
+    return "" if e.older else _keyed(e, o)
 
 
 def arithmetic(e: Evidence, o: Origin) -> str | None:

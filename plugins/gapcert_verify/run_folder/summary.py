@@ -25,7 +25,7 @@ from gapcert_verify.sentences import states
 
 from .origin import Origin
 
-_OWN = {"form", "predictor", "domain", "arrays", "versions", "symmetry", "cover", "seed", "digests", "arithmetic"}
+_OWN = {"format", "form", "predictor", "domain", "arrays", "versions", "symmetry", "cover", "seed", "digests", "arithmetic"}
 """What a certificate stores beside its summary."""
 
 
@@ -44,7 +44,8 @@ def root(e: Evidence) -> str | None:
     """ "" where every file that the root names is what it was, and the root is theirs."""
     stated = read(e, "root.json")
     if stated is None:
-        return "root.json is missing from the folder of a run" if (e.folder / "summary.json").exists() else None
+        run = not e.older and (e.folder / "summary.json").exists()
+        return "root.json is missing from the folder of a run" if run else None
     files = stated["files"]
     for name, digest in files.items():
         path = e.folder / name
@@ -67,6 +68,8 @@ def summary(e: Evidence, o: Origin) -> str | None:
     name, run = o.build.spec.config.name, Path(told["run_dir"]).name
     if told["name"] != name or run != f"{name}-{o.build.spec.digest[:8]}":
         return f"the summary is of {told['name']} in {run}, and the spec is {name}"
+    if e.older:
+        return _controlled(e, told) or _looped(e, told)
     known = {"name", "run_dir", "verdict", "reason", "certificate", "controller", "closed_loop", "beside", "timings"}
     if more := sorted(set(told) - known - {"expectations"}):
         return f"'{more[0]}' is no part of a summary that is known"
@@ -215,7 +218,11 @@ def _broken(row: Mapping[str, Any]) -> str:
 
 
 def whole_run(e: Evidence) -> str | None:
-    """ "" where the folder of a run holds its spec."""
+    """ "" where the folder of a run holds its spec, and all of it is of one format."""
+    if e.data.get("format", 2) != 2:
+        return f"the certificate is of format {e.data['format']}, and 2 is known"
+    if e.older and ((e.folder / "root.json").exists() or {"units", "period"} & set(e.data["domain"]) or "arithmetic" in e.data):
+        return "the certificate is of no format, and what it holds is of format 2"
     if not (e.folder / "summary.json").exists():
         return None
     lost = [n for n in ("spec.json", "run.json", "figures.json") if not (e.folder / n).exists()]
