@@ -101,11 +101,11 @@ def test_a_run_is_gone_on_with_verified_and_its_controller_answers(writer, writt
     ledger, samples = (written / name / "ledger.json").read_bytes(), bits(next((written / name).glob(f"{name}-*/samples")))
     run = gc.run(written / f"{name}.yaml", out=written / name)
     assert [run.folder] == list((written / name).glob(f"{name}-*"))
-    assert run.summary["certificate"]["audit"]["number"] == 1
-    # Closed loops were not counted then; the audits stand as they were.
+    # Its γ has another e today and is another function; the audit of before counts for the same question, and stands as it was.
+    assert run.summary["certificate"]["audit"]["number"] == 2
     book = json.loads((written / name / "ledger.json").read_text())
-    assert (book["older"], [kind for _, kind, _, _ in book["lines"]]) == (json.loads(ledger), ["closed loop"])
-    assert bits(run.folder / "samples") == samples
+    assert (book["older"], [kind for _, kind, _, _ in book["lines"]]) == (json.loads(ledger), ["audit", "closed loop"])
+    assert samples.items() <= bits(run.folder / "samples").items()
     with zipfile.ZipFile(WRITTEN / "written.zip") as archive:
         shutil.rmtree(run.folder)
         archive.extractall(written)
