@@ -20,12 +20,13 @@ from typing import Any
 
 import numpy as np
 
-from gapcert.plugin import load_spec, registry
+from gapcert.plugin import beside_nominal, load_spec, registry
 from gapcert.run.folder import sealed
+from gapcert_cells import load_controller
 from gapcert_verify import sentences, verify_run
 from gapcert_verify.evidence import load
 
-OWN = {"form", "predictor", "domain", "arrays", "versions", "symmetry", "cover", "seed", "digests", "arithmetic"}
+OWN = {"format", "form", "predictor", "domain", "arrays", "versions", "symmetry", "cover", "seed", "digests", "arithmetic"}
 """What a certificate stores beside its summary."""
 
 TRUSTED = {
@@ -279,6 +280,16 @@ class Forger:
         if (run / "summary.json").exists() and not made.subject.startswith("summary.json:certificate"):
             told = json.loads((run / "summary.json").read_text())
             told["certificate"] = {k: v for k, v in data.items() if k not in OWN}
+            (run / "summary.json").write_text(json.dumps(told))
+        if not made.subject.startswith("summary.json:controller"):
+            self._controllers(run)
+
+    def _controllers(self, run: Path) -> None:
+        """The summary's row says what the saved controllers do."""
+        told = json.loads((run / "summary.json").read_text())
+        if told.get("controller"):
+            careful, trusting = (load_controller(run / "controller" / n).facts() for n in ("with_gamma", "without_gamma"))
+            told["controller"].update(json.loads(json.dumps({**careful, **beside_nominal(careful, trusting)}, default=str)))
             (run / "summary.json").write_text(json.dumps(told))
 
     def _spec(self, run: Path) -> None:
