@@ -10,95 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 from forgeries import Forger, Forgery
+from run_kinds import KINDS, made
 
 import gapcert as gc
 from gapcert_verify import verify_run
-
-MODEL = {
-    "kind": "equations",
-    "states": {"x": "m", "v": "m/s"},
-    "inputs": {"F": "N"},
-    "parameters": {"m": "2 kg", "b": "0.3 N*s/m"},
-    "derivative": {"x": "v", "v": "(F - b*v)/m"},
-    "integrator": "euler",
-    "period": "50 ms",
-}
-BACKEND = {
-    **MODEL,
-    "parameters": {"m": "2 kg", "b": "0.34 N*s/m", "c": "0.05 N*s^2/m^2"},
-    "derivative": {"x": "v", "v": "(F - b*v - c*v*abs(v))/m"},
-    "integrator": "rk4",
-}
-PLAIN: dict[str, Any] = {
-    "version": 1,
-    "model": MODEL,
-    "backend": BACKEND,
-    "domain": {"x": [-1, 1], "v": [-1.5, 1.5], "F": [-2, 2]},
-    "sampling": {"kind": "adaptive", "budget": 120, "executor": "threads"},
-    "certificate": {"claim": "statistical", "violation": 0.05, "confidence": 0.95, "attack": 500},
-    "report": {"rerun": False, "html": False},
-    "expect": {"verdict": "holds"},
-}
-PROVED = {"residual": {"kind": "interval", "boxes": 256}}
-STATED = {"x": {"x": 0, "v": 0.01, "F": 0.01}, "v": {"x": 0, "v": 0.06, "F": 0.02}}
-DETERMINISTIC = {"claim": "deterministic", "violation": 0.05, "confidence": 0.95}
-STAY = {"invariance": {"x": [-0.8, 0.8], "v": [-1, 1]}}
-CELLS = {"kind": "symbolic", "goal": STAY, "cells": {"x": 16, "v": 16}, "inputs": {"F": 5}}
-KINDS: dict[str, dict[str, Any]] = {
-    "statistical": {"gap": {"kind": "envelope", "predictor": "affine"}},
-    "controller": {
-        "lipschitz": PROVED,
-        "certificate": DETERMINISTIC,
-        "controller": CELLS,
-        "closed_loop": {"steps": 10, "starts": 4},
-        "report": {"rerun": False, "html": True},
-    },
-    "constant": {"lipschitz": PROVED, "certificate": DETERMINISTIC, "gap": {"kind": "constant"}},
-    "theorem1": {
-        "lipschitz": {"residual": {"kind": "declared", "values": STATED}},
-        "sampling": {"kind": "grid", "counts": {"x": 3, "v": 10, "F": 10}, "executor": "threads"},
-        "gap": {"kind": "basis", "functions": ["1", "abs(v)", "v^2"]},
-        "certificate": {**DETERMINISTIC, "route": "theorem1"},
-        "symmetries": {"translation": ["x"]},
-    },
-    "multilinear": {
-        "lipschitz": {
-            "residual": {"kind": "declared", "values": STATED, "curvature": {k: dict.fromkeys("xvF", 1.0) for k in "xv"}}
-        },
-        "sampling": {"kind": "lattice", "budget": 120, "executor": "threads"},
-        "gap": {"kind": "multilinear"},
-        "certificate": DETERMINISTIC,
-    },
-    "calibrated": {
-        "backend": {"kind": "stochastic", "of": BACKEND, "sensor_noise": {"x": "1 mm", "v": "2 mm/s"}},
-        "sampling": None,
-        "certificate": {"claim": "statistical", "route": "calibrate", "violation": 0.1, "confidence": 0.9, "exceedances": 1},
-    },
-    "declared": {
-        "backend": None,
-        "sampling": None,
-        "certificate": None,
-        "gap": {"kind": "declared", "gamma": {"x": 0.001, "v": 0.005}},
-        "controller": CELLS,
-    },
-    "empirical": {
-        "certificate": {"claim": "empirical", "violation": 0.05, "confidence": 0.95},
-        "lipschitz": {"residual": {"kind": "piecewise", "budget": 4000}},
-    },
-    "mpc": {
-        "lipschitz": PROVED,
-        "certificate": DETERMINISTIC,
-        "controller": {"kind": "mpc", "goal": STAY, "horizon": 5},
-        "closed_loop": {"steps": 5, "starts": 2},
-    },
-}
-
-
-def made(kind: str, out: Path) -> Path:
-    """An honest run of a kind."""
-    spec = {k: v for k, v in {**PLAIN, **KINDS[kind], "name": kind}.items() if v is not None}
-    return gc.run(spec, out=out).folder
-
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
