@@ -133,11 +133,11 @@ def _bare(e: Evidence) -> bool:
 
 
 def _stated(e: Evidence) -> str:
-    gamma, states = e.arrays["gap.gamma"], e.data["domain"]["axes"][: e.data["domain"]["states"]]
-    if e.data["claim"] != {"kind": "assumed"} or e.data["form"] != {"form": "constant"}:
-        return f"the claim is {e.data['claim']} of {e.data['form']}, and what is declared is an assumed constant"
-    if gamma.tolist() != [e.data["states"][n]["gamma_max"] for n in states]:
-        return f"γ is stored as {gamma.tolist()}, and stated otherwise"
+    gamma, names = e.arrays["gap.gamma"], sentences.states(e)
+    made = {"claim": {"kind": "assumed"}, "form": {"form": "constant"}, "vacuous": False}
+    made["states"] = {n: {"gamma_max": g} for n, g in zip(names, gamma.tolist(), strict=True)}
+    if other := next((k for k, v in made.items() if e.data.get(k) != v), ""):
+        return f"{other} is stated as {e.data.get(other)}, and of a declared γ it is {made[other]}"
     return "" if (np.isfinite(gamma) & (gamma >= 0)).all() else f"γ is {gamma.tolist()}, which bounds nothing"
 
 
@@ -167,7 +167,7 @@ def _trusted(e: Evidence, source: Origin | str | UsageError) -> list[str]:
     proved = origin["provenance"] == "interval" and whole and e.data["predictor"] != "multilinear"
     told += [
         (f"What only f̂ can tell, residuals, hidden state, purity and attacks, is as stated: {why}.", not whole),
-        ("How f̂ answered when it was asked again is as stated.", not e.data.get("calibration", {}).get("noise")),
+        ("How f̂ answered when it was asked again is as stated.", whole and not e.data.get("calibration", {}).get("noise")),
         ("The number of the audit is what the book beside the run folders counted; the book was not looked at.", True),
         (
             "The audit's points were drawn by the rule before the book's format 2, of seed and number: a fit could know them.",

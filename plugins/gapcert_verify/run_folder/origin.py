@@ -123,6 +123,8 @@ def origin(folder: Path, allow_code: bool = False, engine: bool = False) -> Orig
         return f"{lost[0]}, which the spec names, is not there"
     try:
         spec = load_spec(data, folder=home)
+        if not f"{mark['name']}-".startswith(f"{spec.config.name}-"):  # one of a matrix has words more
+            raise UsageError(f"{folder}: spec.json is of {spec.config.name}, and {mark['name']} was run")
         spec = replace(spec, config=replace(spec.config, name=mark["name"]))
         if spec.digest != mark["spec"]:
             raise UsageError(f"{folder}: spec.json, or a file that it names, is another one than was run")
