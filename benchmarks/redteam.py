@@ -34,7 +34,7 @@ from scipy.stats import binom
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "runs" / "redteam.jsonl"
-QUICK = {"certificates": 8, "games": 8, "mpc": 2, "networks": 20, "formulas": 300, "calibrations": 2}
+QUICK = {"certificates": 8, "games": 8, "mpc": 2, "networks": 20, "formulas": 300, "calibrations": 2, "forgeries": 1}
 SIGNIFICANT, USUAL = 1e-3, 0.99
 PATIENCE = 900
 """Seconds for one claim."""
@@ -121,7 +121,7 @@ def line(kind: str, rows: list[dict[str, Any]]) -> list[str]:
 HEAD = [
     "kind",
     "claims",
-    "points, steps, words",
+    "points, steps, words, forgeries",
     "deterministic, broken",
     "statistical, above ε",
     "empirical / refused / error",

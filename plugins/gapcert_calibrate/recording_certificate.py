@@ -132,8 +132,8 @@ class CalibratedRecording(SavedStatement):
     """A band that holds for all transitions of a further window, with probability 1 − ε on average over calibrations.
 
     `units` windows met Z; those of `fit` gave the band, those of `held` its widening: score · scale, (nx,), with the score of
-    `rank` among their `scores`. `states` are figures over the transitions of the held windows. entry: which calibration on
-    these measurements it is, where a book counts them.
+    `rank` among their `scores`. `states` are figures over the transitions of the held windows. window: the length of one in s,
+    None for whole trajectories. entry: which calibration on these measurements it is, where a book counts them.
     """
 
     gap: CalibratedGap
@@ -201,6 +201,7 @@ class CalibratedRecording(SavedStatement):
     def summary(self) -> dict[str, Any]:
         measured = {
             "units": self.units,
+            "window": self.window,
             "windows": {"fit": len(self.fit), "calibration": len(self.held)},
             "transitions": {"fit": len(self.fit.z), "calibration": len(self.held.z)},
             "rows": self.held.unused,

@@ -33,7 +33,7 @@ from gapcert.plugin import (
 from gapcert_bounds import calibrated, stored
 from gapcert_monitor.thresholds import THRESHOLDS
 from gapcert_recordings import Copies, Transitions, axes
-from gapcert_verify import Evidence, bounds, load
+from gapcert_verify import Evidence, bounds, load, verify_run
 
 from .drift import drift as _drift
 
@@ -94,7 +94,8 @@ class Certified(Statement):
     def load(cls, folder: Path | str, allow_code: bool = False) -> Certified:
         """From a run's folder: its spec makes the model, its stored certificate the band; the backend is not needed.
 
-        Only where the certificate counts hidden states of the backend among its states is the backend built.
+        Only where the certificate counts hidden states of the backend among its states is the backend built. UsageError where
+        `gapcert verify` refuses the folder.
         """
         with damage_told(folder):
             return cls._loaded(Path(folder), allow_code)
@@ -104,6 +105,8 @@ class Certified(Statement):
         from gapcert.plugin import Build, ModelPredictor, load_spec, regular, widen
 
         evidence, data = load(where), _stored(where, "spec.json")
+        if failed := next((c for c in verify_run(where, allow_code=allow_code)["checks"] if not c["passed"]), None):
+            raise UsageError(f"{where}: is not what it claims ({failed['check']}: {failed['detail']}); run the spec again")
         home = Path(_stored(where, "run.json").get("folder", "."))
         # What is not asked for need not be there: neither engines nor their files.
         only = {k: data[k] for k in ("version", "name", "model")}

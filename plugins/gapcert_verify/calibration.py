@@ -120,10 +120,10 @@ def _scale(e: Evidence) -> str:
 def _rank(e: Evidence, z: Array, residuals: list[Array]) -> str:
     """The score is the (N − m)-th smallest."""
     made = e.data["calibration"]
-    return _ranked(e, made, _scores(e, z, residuals), len(z) - made["exceedances"])
+    return _ranked(e, made, scores(e, z, residuals), len(z) - made["exceedances"])
 
 
-def _scores(e: Evidence, z: Array, residuals: list[Array]) -> Array:
+def scores(e: Evidence, z: Array, residuals: list[Array]) -> Array:
     """(2, n): no more and no less than the score of each point, the largest of its draws."""
     scale = e.arrays["calibration.scale"]
     low, high = uncalibrated(e, z, "predictor.calibration")
@@ -172,7 +172,7 @@ def windows(e: Evidence) -> str:
         return text
     if text := _scale(e):
         return text
-    ends = np.stack([order_statistics.worst(own, arrays["held.window"]) for own in _scores(e, z, [arrays["held.r"]])])
+    ends = np.stack([order_statistics.worst(own, arrays["held.window"]) for own in scores(e, z, [arrays["held.r"]])])
     return _ranked(e, made, ends, made["rank"])
 
 
