@@ -205,6 +205,7 @@ class CalibratedRecording(SavedStatement):
             "windows": {"fit": len(self.fit), "calibration": len(self.held)},
             "transitions": {"fit": len(self.fit.z), "calibration": len(self.held.z)},
             "rows": self.held.unused,
+            "trajectories": len(self.held.copies.rows),
             "copies": self.held.copies.summary(),
             "rank": self.rank,
             "score": self.score,

@@ -407,21 +407,27 @@ def _windows(e: Evidence) -> Iterator[Said]:
         f"such transition and {rows['outside']:,} one outside Z or in no whole window; nothing is said of them."
     )
     yield "It does not carry over to other inputs, machines or days, nor to a closed loop that chooses its own points."
-    if once := [copy for copy, _ in copies(e)]:
-        yield f"What is in the recording twice counts once: {'; '.join(once)}. Windows with such rows are left out."
+    if once := copies(e):
+        yield f"{once}; windows with such rows are left out."
 
 
-def copies(e: Evidence) -> list[tuple[str, str]]:
-    """(copy, warning) of what a recording is said to hold twice; which rows these are the recording alone can tell."""
-    known = re.compile(
-        rf"'.{{1,200}}' (?:is a copy of '.{{1,200}}'|has \d+ rows from {NUMBER} s on that are a copy of rows of '.{{1,200}}')|"
-        r"and \d+ more"
-    )
-    said = [(w.removeprefix(_ONCE), w) for w in e.data.get("warnings", []) if isinstance(w, str) and w.startswith(_ONCE)]
-    return [pair for pair in said if known.fullmatch(pair[0])]
+def copies(e: Evidence) -> str:
+    """What its list of copies says in words, empty where it is; which rows these are the recording alone can tell."""
+    made = e.data["recording"]
+    whole, parts = ([c for c in made.get("copies", []) if c["whole"] is k] for k in (True, False))
+    if not (found := [*whole, *parts]):
+        return ""
+    named = [f"'{c['name']}' {'is a copy ' if k == 0 else ''}of '{c['of']}'" for k, c in enumerate(whole)]
+    named += [f"'{c['name']}' has {c['rows']} rows from {c['start']:.6g} s on that are a copy of rows of '{c['of']}'" for c in parts]
+    rest = [f"and {len(named) - NAMED} more"] if len(named) > NAMED else []
+    has, have = ("has rows that are", "have rows that are") if parts else ("is", "are")
+    count = len({c["name"] for c in found})
+    are = f"{has} a copy and counts" if count == 1 else f"{have} copies of others and count"
+    return f"{count} of {made['trajectories']} trajectories {are} once: {', '.join([*named[:NAMED], *rest])}"
 
 
-_ONCE = "counted once: "
+NAMED = 3
+"""Copies that are told by name."""
 
 
 def _book(e: Evidence) -> Iterator[Said]:
@@ -510,7 +516,8 @@ def _slopes(e: Evidence) -> list[re.Pattern[str]]:
 def _recorded(e: Evidence) -> Iterator[Said]:
     made, period = e.data["recording"], e.data["domain"]["period"]
     rows = made["rows"]
-    yield from (warning for _, warning in copies(e))
+    if once := copies(e):
+        yield once
     if 2 * rows["no_transition"] > rows["all"]:
         yield (
             f"{rows['no_transition']:,} of {rows['all']:,} rows begin no transition of one period of {period:g} s (the next "

@@ -231,6 +231,7 @@ def test_a_proof_goes_on_where_it_was_stopped(forged, monkeypatch, tmp_path):
 def test_what_was_proved_of_another_controller_is_not_believed(forged, monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(grid_proof, "PAIRS", 500)
+    monkeypatch.setattr(saved, "PAUSE", 0.0)
 
     def stop(event):
         raise KeyboardInterrupt
