@@ -30,6 +30,8 @@ from .search.candidates import Candidate, Library
 from .search.criterion import keys, without
 from .search.engine_settings import Setting, across
 
+_MEASURED = {"input": "{} where it acts", "output": "{} with a second sensor", "coordinate": "the force at {}"}
+
 
 def diagnose(
     model: Model,
@@ -193,7 +195,7 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
         gain,
         _extended(answer),
         tuple(ties),
-        None if design is None else _experiment(answer),
+        _experiment(answer, design is not None),
         rest,
         figure(answer.search, answer.causes, answer.fit, judge, design, rest.correction if rest else None, plain),
         design=design,
@@ -369,11 +371,13 @@ def _misfits(answer: Answer) -> dict[str, Misfit]:
     return {c.name: Misfit(*map(float, row)) for c, *row in zip(m.channels, old, new, m.sigma, strict=True)}
 
 
-def _experiment(answer: Answer) -> str | None:
-    """What would tell the first tie apart."""
+def _experiment(answer: Answer, separable: bool) -> str | None:
+    """What would tell the first tie apart; of what no input separates, what to measure besides, where sites differ."""
     for tie, _ in answer.ties:
         a, b = without(answer.causes, tie)[0], without(tie, answer.causes)[0]
         known = a.effect.rivals.get(b.effect.name) or b.effect.rivals.get(a.effect.name)
         text = known or f"{a.effect.experiment}; {b.effect.experiment}"
+        if not separable and a.site != b.site:
+            text = f"measure {', or '.join(_MEASURED.get(c.effect.site, '{} by itself').format(c.site) for c in (a, b))}"
         return f"to tell {a.effect.name} at {a.site} from {b.effect.name} at {b.site}: {text}"
     return None

@@ -13,6 +13,7 @@ from gapcert.plugin import Array, Model, Recording, UsageError, difference, magn
 
 from .data.dataset import Dataset, Windows, flat
 from .fitting.fit import Fit, fit, nearby
+from .fitting.hypothesis import between
 from .results import Experiment
 from .search.candidates import Causes
 from .thresholds import THRESHOLDS
@@ -45,9 +46,7 @@ class Limits:
 
     @classmethod
     def of(cls, model: Model, measured: Dataset, given: Mapping[str, Any] | None = None, seconds: float = 12.0) -> Limits:
-        """Where nothing is given: inputs as in the data, or off; outputs as far again on either side, and no farther than the
-        model holds. Texts may carry units.
-        """
+        """Where nothing is given: inputs as in the data, or off; outputs as in the data. Texts may carry units."""
         asked = {}
         units = {s.name: s.unit for s in (*model.inputs, *measured.channels)}
         for name, pair in (given or {}).items():
@@ -64,17 +63,14 @@ class Limits:
                 raise UsageError(f"{what}; expected [low, high] with low < high", (*LIMITS, name))
             asked[name] = low, high
         u, y = np.concatenate(measured.inputs), np.concatenate(measured.outputs)
-        inputs = {s.name: _range(np.append(u[:, i], np.zeros(len(u) // 100 + 1)), 0.0) for i, s in enumerate(model.inputs)}
-        outputs = {
-            s.name: _range(y[:, i], THRESHOLDS.output_room, model.within.get(s.name)) for i, s in enumerate(measured.channels)
-        }
+        inputs = {s.name: _range(np.append(u[:, i], np.zeros(len(u) // 100 + 1))) for i, s in enumerate(model.inputs)}
+        outputs = {s.name: _range(y[:, i]) for i, s in enumerate(measured.channels)}
         return cls({n: asked.get(n, r) for n, r in inputs.items()}, {n: asked.get(n, r) for n, r in outputs.items()}, seconds)
 
 
-def _range(values: Array, room: float, ends: tuple[float, float] | None = None) -> tuple[float, float]:
-    low, high = np.nanquantile(values, [0.001, 0.999])
-    first, last = ends or (-math.inf, math.inf)
-    return max(float(low - room * (high - low)), first), min(float(high + room * (high - low)), last)
+def _range(values: Array) -> tuple[float, float]:
+    low, high = np.nanquantile(values, [0.001, 0.999]).tolist()
+    return low, high
 
 
 def design(
@@ -215,15 +211,20 @@ def _within(
 
 
 def _played(fitted: Fit, u: Array, measured: Dataset) -> Array:
-    """Measured channels (n, T, ny) of the fitted model under u (n, T, nu), from where the first recording started."""
+    """Measured channels (n, T, ny) of the fitted model under u (n, T, nu), from where the first recording started.
+
+    What comes late shows that start until then.
+    """
     h, n, repeat = fitted.hypothesis, len(u), measured.repeat
     values = {**h.fixed, **fitted.values}
     fine = np.repeat(u, repeat, axis=1)
     x0 = np.tile(measured.states[0][0], (n, 1))
     with np.errstate(all="ignore"):
         x = h.model.fast_rollout(x0, fine, parameters=values or None).x[:, :-1:repeat]
-        y = h.model.output(flat(x), flat(u))
-    return np.asarray(y[:, measured.columns].reshape(n, u.shape[1], -1))
+        y = h.model.output(flat(x), flat(u))[:, measured.columns].reshape(n, u.shape[1], -1)
+        late = h.model.output_delays(values or None)[..., measured.columns] / measured.period
+        ahead = np.maximum(-late, -np.arange(u.shape[1])[:, None])
+        return between(y[None], ahead)[0] if late.any() else y
 
 
 def _log(fitted: Fit, u: Array, measured: Dataset) -> Dataset | None:
@@ -282,14 +283,15 @@ def _experiment(trial: _Trial, name: str, measured: Dataset) -> Experiment:
     chosen = table[name]
     inputs = {s.name: chosen.u[:, i] for i, s in enumerate(pair.here.hypothesis.model.inputs)}
     (a, b), (c, d) = pair.named, pair.other
-    far = chosen.told
+    far, y = chosen.told, np.concatenate([_played(f, chosen.u[None], measured)[0] for f in (pair.here, pair.there)])
+    travel = {s.name: (float(y[:, i].min()), float(y[:, i].max()), s.unit) for i, s in enumerate(measured.channels)}
     sentence = (
         f"to tell {a} at {b} from {c} at {d}: play {name} for {len(chosen.u) * measured.period:.3g} s; "
         f"their predictions then differ by {far:.2g} times the noise, by {math.sqrt(chosen.expected):.2g} sigma in all"
     )
     others = {n: s.told for n, s in table.items() if n != name}
     t = np.asarray(np.arange(len(chosen.u)) * measured.period)
-    return Experiment((pair.named, pair.other), name, sentence, t, inputs, far, others)
+    return Experiment((pair.named, pair.other), name, sentence, t, inputs, far, others, travel)
 
 
 def shapes(limits: Mapping[str, tuple[float, float]], seconds: float, measured: Dataset, seed: int) -> dict[str, Array]:

@@ -153,7 +153,8 @@ class Experiment:
     """An input that tells two rivals apart: computed from both fits, inside the limits.
 
     t (T,) in s, inputs: name → (T,); separation: rms distance, in units of the noise floor, between what one rival predicts
-    and the best that the other can do to copy it; others: separation of every other input that was tried, by its name.
+    and the best that the other can do to copy it; others: separation of every other input that was tried, by its name;
+    travel: of every measured output (lowest, highest, unit), as either rival expects it.
     """
 
     rivals: tuple[tuple[str, str], tuple[str, str]]
@@ -163,13 +164,15 @@ class Experiment:
     inputs: Mapping[str, Array]
     separation: float
     others: Mapping[str, float] = field(default_factory=dict)
+    travel: Mapping[str, tuple[float, float, str]] = field(default_factory=dict)
 
     def summary(self) -> dict[str, Any]:
         """As plain data, without the signal."""
         rivals = [{"effect": e, "site": s} for e, s in self.rivals]
         seconds = float(np.ptp(self.t)) if len(self.t) else 0.0
         told = {"name": self.name, "sentence": self.sentence, "seconds": seconds, "separation": self.separation}
-        return {"rivals": rivals, **told, "others": dict(self.others)}
+        travel = {n: {"low": low, "high": high, "unit": unit} for n, (low, high, unit) in self.travel.items()}
+        return {"rivals": rivals, **told, "travel": travel, "others": dict(self.others)}
 
     def csv(self) -> str:
         """As a file to play: column t in s, then every input in the model's unit, held from one row to the next."""

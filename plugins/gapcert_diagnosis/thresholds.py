@@ -18,7 +18,6 @@ class Thresholds:
     guard_windows: int = decides(4, "at least, among those that judge what the others suggest")
     usual_samples: int = chosen(30, "in a window at least, before windows are made shorter to be more")
     usual_windows: int = chosen(8, "that a short recording is cut into: fewer cannot be resampled")
-    output_room: float = chosen(1.0, "of its range in the data, by which an output may leave it where no limit is given")
     input_sizes: tuple[float, ...] = chosen((1.0, 0.5, 0.25, 0.1), "of the limits, in turn until outputs stay within theirs")
     settled_fall: float = chosen(25.0, "expected fall in score that settles which rival is right: five standard errors")
     nested_separation: float = chosen(0.1, "of the larger one: below, one rival copies the other, and only charges differ")

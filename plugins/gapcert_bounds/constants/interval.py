@@ -66,7 +66,8 @@ class IntervalJacobian(LipschitzEstimator):
         bound, lower = _slopes(fhat, problem, boxes).mag, _reached(fhat, problem, boxes)
         while len(boxes) < self.boxes:
             loose = np.where(bound > lower * (1 + 1e-3) + np.finfo(float).tiny, bound, 0.0)
-            # A box is urgent where it holds an entry's largest bound, or nearly does.
+            # A box is urgent where it holds an entry's largest bound, or nearly does; ∞ / ∞ would be NaN.
+            loose = np.minimum(loose, np.finfo(float).max)
             urgency = (loose / np.maximum(loose.max(axis=0), np.finfo(float).tiny)).max(axis=(1, 2))
             if urgency.max() == 0:
                 break

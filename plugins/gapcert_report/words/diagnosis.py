@@ -111,16 +111,16 @@ def _causes(summary: Summary) -> str:
     gain, second = gain_phrase(summary), runner_up_phrase(summary)
     text = "; ".join(p for p in (head, gain, second) if p) + "."
     same = [listed([cause_name(c) for c in group]) for group in summary.get("ambiguous_with", ())]
-    return f"{text} {_alike(same, summary.get('seconds'))}" if same else text
+    return f"{text} {_alike(same, summary.get('seconds'), summary.get('experiment'))}" if same else text
 
 
-def _alike(same: Sequence[str], seconds: float | None) -> str:
-    """What no experiment tells apart from the answer, and the limit that a longer one needs."""
-    rivals = ", or from ".join(same)
+def _alike(same: Sequence[str], seconds: float | None, told: str | None) -> str:
+    """What no experiment tells apart from the answer, the limit that a longer one needs, and what to measure besides."""
+    rivals, besides = ", or from ".join(same), f" {told[:1].upper()}{told[1:]}." if told else ""
     if seconds is None:
-        return f"No input within the limits separates this from {rivals}."
+        return f"No input within the limits separates this from {rivals}.{besides}"
     longer = "a longer one may (diagnose.experiment.seconds)"
-    return f"No input of {seconds:.3g} s within the limits separates this from {rivals}; {longer}."
+    return f"No input of {seconds:.3g} s within the limits separates this from {rivals}; {longer}.{besides}"
 
 
 def _means(setting: str) -> str:
@@ -224,10 +224,15 @@ def _ambiguous(summary: Summary) -> str:
 
 
 def experiment_sentence(design: Summary) -> str:
-    """What to play, and how far the rivals then are apart."""
+    """What to play, where that leads, and how far the rivals then are apart."""
     size = number(float(f"{design['separation']:.2g}"))
     apart = f"what one predicts then stays {size} noise floors from the best copy by the other"
-    return f"To decide, play {design['name']} for {number(design['seconds'], 3)} s: {apart}."
+    ways = [
+        f"{name} between {number(y['low'], 3)} and {measured(number(y['high'], 3), y['unit'])}"
+        for name, y in design.get("travel", {}).items()
+    ]
+    leads = f" It should keep {listed(ways)}." if ways else ""
+    return f"To decide, play {design['name']} for {number(design['seconds'], 3)} s: {apart}.{leads}"
 
 
 def _unexplained(summary: Summary) -> str:
