@@ -19,7 +19,7 @@ from gapcert.numerics.arrays import Array, Bools, Ints
 from gapcert.numerics.interpolation import on_curvature
 from gapcert.numerics.order_statistics import NO_CONSTANTS
 
-_PAIRS = 1_000_000  # that are looked at together
+_PAIRS = 100_000  # that are looked at together
 ADVICE = "use lipschitz.residual: {kind: piecewise}"
 
 
@@ -60,16 +60,15 @@ def _worst_pair(z: Array, g: Array, constants: Array, slack: Array, first: Any =
     """Among all pairs, or those that begin with a row of `first`."""
     worst: dict[str, Any] | None = None
     first = np.arange(len(z)) if first is None else first
-    block = max(1, _PAIRS // max(1, len(z)))
-    for i in range(g.shape[1] if len(z) else 0):
-        for a in range(0, len(first), block):
-            rows = first[a : a + block]
-            allowed = (np.abs(z[rows, None] - z[None]) * constants[i]).sum(axis=2)
-            excess = np.abs(g[rows, None, i] - g[None, :, i]) - allowed * (1 + 1e-12) - slack[i] * (1 + 1e-12)
-            k, m = np.unravel_index(int(np.argmax(excess)), excess.shape)
-            if excess[k, m] > (worst["excess"] if worst else 0.0):
-                worst = {"state": i, "z": z[rows[k]].tolist(), "other": z[m].tolist(), "excess": float(excess[k, m])}
-                worst |= {"change": float(abs(g[rows[k], i] - g[m, i])), "allowed": float(allowed[k, m] + slack[i])}
+    block, finite = max(1, _PAIRS // max(1, len(z))), np.minimum(constants, 1e300)
+    for a in range(0, len(first) if len(z) else 0, block):
+        rows = first[a : a + block]
+        allowed, change = np.abs(z[rows, None] - z[None]) @ finite.T, np.abs(g[rows, None] - g[None])
+        excess = change - (allowed + slack) * (1 + 1e-12)
+        at = k, m, i = np.unravel_index(int(np.argmax(excess)), excess.shape)
+        if excess[at] > (worst["excess"] if worst else 0.0):
+            worst = {"state": int(i), "z": z[rows[k]].tolist(), "other": z[m].tolist(), "excess": float(excess[at])}
+            worst |= {"change": float(change[at]), "allowed": float(allowed[at] + slack[i])}
     return worst
 
 
