@@ -145,10 +145,7 @@ def declared(problem: GapProblem, gap: GapFunction, residual: Residual, assumed:
 
 
 def by_audit(problem: GapProblem, z: Array, r: Array, most: int = 16_000_000) -> dict[str, Any] | None:
-    """Two points, one of the audit, that contradict declared constants or a declared symmetry; None where nothing was.
-
-    Of `most` pairs at most: each point with an even selection of the samples.
-    """
+    """Two of some `most` pairs of a point of the audit and a sample that contradict declared constants or a symmetry, or None."""
     if problem.lipschitz.provenance != "declared" and problem.symmetry is None:
         return None
     own, count = problem.samples, min(most // len(z) + 1, len(problem.samples))
