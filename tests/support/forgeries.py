@@ -45,7 +45,7 @@ TRUSTED = {
     r"samples/.*": "constants|What only f̂ can tell|stored transitions|order is trusted",
     r"certificate\.npz:(lipschitz|curvature.*|cells.*)": "constants",
     r"certificate\.json:warnings.*": "warned of slopes",
-    r"certificate\.npz:(held|fit)\..*|certificate\.json:recording\.rows\..*": "stored transitions",
+    r"certificate\.npz:(held|fit)\..*|certificate\.json:recording\.rows\..*|spec\.json:recording\..*": "stored transitions",
 }
 """Of which subjects (as patterns of `Forgery.subject`) a sentence of `trusted` speaks, as a pattern of that sentence."""
 

@@ -271,6 +271,24 @@ def predictor(e: Evidence, o: Origin) -> Predictor:
     return AffinePredictor.none(nx, nz)
 
 
+def resolved(e: Evidence, o: Origin) -> str | None:
+    """What r − p is known to: e and that of p; of a recording e is that of a step of f and of what was measured."""
+    if e.older or "resolution" not in e.arrays or e.data["predictor"] == "multilinear":
+        return None
+    own, (z, r) = e.arrays["resolution"], e.samples
+    whole = own + predictor(e, o).resolution(o.domain)
+    if not np.allclose(e.arrays["remainder.resolution"], whole, rtol=_SAME, atol=0.0):
+        return f"r − p is said to be known to {e.arrays['remainder.resolution'].tolist()}, and is to {whole.tolist()}"
+    if "recording" not in e.data:
+        return ""
+    size = np.abs(z[:, : o.model.nx]).max(axis=0) + np.abs(r).max(axis=0)
+    made = o.model.resolution(size) + 4 * np.spacing(size)
+    # Of many transitions some are stored, and the others may have been larger.
+    most = made if len(z) == e.data["recording"]["transitions"]["fit"] else np.inf
+    sure = (own >= made * (1 - _SAME)) & (own <= most * (1 + _SAME))
+    return "" if sure.all() else f"e is stated as {own.tolist()}, and follows as {made.tolist()}"
+
+
 def predicted(e: Evidence, o: Origin) -> str | None:
     """An affine predictor is the one that fits the first samples; the stored values of one that is a model are that model's."""
     if e.data["predictor"] == "affine" == o.asked["family"].predictor:
@@ -481,6 +499,7 @@ CHECKS: tuple[tuple[str, Check], ...] = (
     ("names, ranges and level are those that the spec asks for", question),
     ("constants come from what the spec asks for", constants),
     ("the predictor is the model that the spec names", predicted),
+    ("r and r − p are known as closely as f, p and what was measured allow", resolved),
     ("e of f and f̂ is known as it is said to be", arithmetic),
     ("residuals and e are those of the spec's f and f̂, stepped again", stepped),
     ("hidden state and inputs do what is said of them", gates),
