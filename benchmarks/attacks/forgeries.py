@@ -11,10 +11,10 @@ import numpy as np
 from attacks import Attempt
 
 sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
-from forgeries import Forger, Forgery  # noqa: E402
-from run_kinds import KINDS, made  # noqa: E402
+from forgeries import Forger, Forgery
+from run_kinds import KINDS, made
 
-from gapcert_verify import verify_run  # noqa: E402
+from gapcert_verify import verify_run
 
 FORGERIES = 10
 """Of one run: that takes longer than one."""

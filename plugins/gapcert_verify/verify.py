@@ -166,7 +166,7 @@ def _trusted(e: Evidence, source: Origin | str | UsageError) -> list[str]:
         constants = "A calibrated band rests on no constants, but on points that no fit has seen: the run's order is trusted."
     proved = origin["provenance"] == "interval" and whole and e.data["predictor"] != "multilinear"
     told += [
-        (f"What only f̂ can tell, residuals, hidden state, purity and attacks, is as stated: {why}.", not whole),
+        (f"{_ONLY}, hidden state, purity and attacks, is as stated: {why}.", not whole),
         ("How f̂ answered when it was asked again is as stated.", whole and not e.data.get("calibration", {}).get("noise")),
         ("The number of the audit is what the book beside the run folders counted; the book was not looked at.", True),
         (
@@ -195,6 +195,7 @@ def _trusted(e: Evidence, source: Origin | str | UsageError) -> list[str]:
     return [text for text, so in told if so]
 
 
+_ONLY = "What only f̂ can tell, that residuals are those of it and of f"
 _NOBODY = "γ is what a person declares. No simulator was asked."
 
 

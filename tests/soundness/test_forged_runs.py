@@ -15,6 +15,7 @@ from run_kinds import KINDS, made
 import gapcert as gc
 from gapcert_verify import verify_run
 
+
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {}
@@ -35,13 +36,12 @@ def run_of(runs: dict[str, Path], kind: str, out: Path) -> Path:
 
 def forged(source: Path, place: Path, seed: int, count: int) -> list[str]:
     """What was accepted of so many forgeries, and is not trusted by name."""
-    forger, found, target = Forger(np.random.default_rng(seed)), [], place / source.name
+    forger, target = Forger(np.random.default_rng(seed)), place / source.name
     shutil.copytree(source, target)
     forger.mend(target, Forgery("nothing"))
     # Whoever makes all digests anew has changed nothing that counts; else a forgery would be caught for its digests alone.
     assert [c for c in verify_run(target)["checks"] if not c["passed"]] == []
-    for _ in range(count):
-        found.append(forger.forge(source, target).answered(target))
+    found = [forger.forge(source, target).answered(target) for _ in range(count)]
     return [text for text in found if text]
 
 

@@ -33,10 +33,11 @@ TRUSTED = {
     r"certificate\.json:versions\..*": "Versions, times",
     r"spec\.json:sampling\..*|spec\.json:lipschitz\.residual\.(budget|boxes|pairs|distance|cells)": "budgets of the spec",
     r"spec\.json:((closed_loop|report|expect)\..*|controller\.(horizon|weights|reference|policy).*)": "budgets of the spec",
+    r"spec\.json:model\..*": "residuals are those of it and of f|γ is what a person declares",
     r"summary\.json:timings\..*": "Versions, times",
     r"figures\.json:lanes\.\d+\.at\..*": "Versions, times",
-    r"controller/with_gamma/controller\.json:evidence\.(levels|rounds|sweeps|reason|nothing).*": "rounds its games took",
-    r"controller/without_gamma/.*": "controller without γ promises nothing",
+    r"controller/with_gamma/controller\.json:evidence\.(levels|rounds|reason|change|gap_over_cells).*": "rounds its games took",
+    r"controller/without_gamma/.*|figures\.(json|npz):/?winning.*": "controller without γ promises nothing",
     r"progress\.jsonl.*|run\.json:(executor|folder)": "Versions, times",
     r"summary\.json:run_dir": "Versions, times",
     r"summary\.json:closed_loop\..*|closed_loop\.npz:.*|figures\.(json|npz):/?loop.*": "closed loop",
@@ -45,7 +46,7 @@ TRUSTED = {
     r"samples/.*": "constants|What only f̂ can tell|stored transitions|order is trusted",
     r"certificate\.npz:(lipschitz|curvature.*|cells.*)": "constants",
     r"certificate\.json:warnings.*": "warned of slopes",
-    r"certificate\.npz:(held|fit)\..*|certificate\.json:recording\.rows\..*": "stored transitions",
+    r"certificate\.npz:(held|fit)\..*|certificate\.json:recording\.rows\..*|spec\.json:recording\..*": "stored transitions",
 }
 """Of which subjects (as patterns of `Forgery.subject`) a sentence of `trusted` speaks, as a pattern of that sentence."""
 

@@ -106,7 +106,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "recording": {
         "backend": None,
         "sampling": None,
-        "recording": {"kind": "csv", "files": ["log.csv"], "time": "t", "trajectory": "run", "columns": dict(zip("xvF", "xvF"))},
+        "recording": {"kind": "csv", "time": "t", "trajectory": "run", "columns": {"x": "x", "v": "v", "F": "F"}},
         "gap": {"kind": "constant"},
         "certificate": {"claim": "statistical", "route": "calibrate", "violation": 0.1, "confidence": 0.9},
     },

@@ -47,7 +47,9 @@ from gapcert.plugin import (
     widen,
 )
 from gapcert_verify.calibration import draws
+from gapcert_verify.calibration import names as calibrations
 from gapcert_verify.evidence import Evidence, bounds
+from gapcert_verify.evidence import predictor as predicted_by
 from gapcert_verify.sentences import states
 
 _SAME = 1e-9  # relative: figures that were added up in another order
@@ -271,22 +273,49 @@ def predictor(e: Evidence, o: Origin) -> Predictor:
     return AffinePredictor.none(nx, nz)
 
 
-def predicted(e: Evidence, o: Origin) -> str | None:
-    """An affine predictor is the one that fits the first samples; the stored values of one that is a model are that model's."""
-    if e.data["predictor"] == "affine" == o.asked["family"].predictor:
-        return _affine(e)
-    if e.data["predictor"] != "model":
+def resolved(e: Evidence, o: Origin) -> str | None:
+    """What r − p is known to: e and that of p; of a recording e is that of a step of f and of what was measured."""
+    if e.older or "resolution" not in e.arrays or e.data["predictor"] == "multilinear":
         return None
-    if not isinstance(o.asked["predictor"], Model):
+    own, (z, r) = e.arrays["resolution"], e.samples
+    whole = own + predictor(e, o).resolution(o.domain)
+    if not np.allclose(e.arrays["remainder.resolution"], whole, rtol=_SAME, atol=0.0):
+        return f"r − p is said to be known to {e.arrays['remainder.resolution'].tolist()}, and is to {whole.tolist()}"
+    if "recording" not in e.data:
+        return ""
+    size = np.abs(z[:, : o.model.nx]).max(axis=0) + np.abs(r).max(axis=0)
+    made = o.model.resolution(size) + 4 * np.spacing(size)
+    # Of many transitions some are stored, and the others may have been larger.
+    most = made if len(z) == e.data["recording"]["transitions"]["fit"] else np.inf
+    sure = (own >= made * (1 - _SAME)) & (own <= most * (1 + _SAME))
+    return "" if sure.all() else f"e is stated as {own.tolist()}, and follows as {made.tolist()}"
+
+
+def predicted(e: Evidence, o: Origin) -> str | None:
+    """An affine predictor is the one that fits the first samples; stored values are those of the one that is stated."""
+    kind = e.data["predictor"]
+    if kind == "model" and not isinstance(o.asked["predictor"], Model):
         return "the predictor is stated as a model, and the spec names none"
-    p, e_p = predictor(e, o), predictor(e, o).resolution(o.domain)
-    points = {"samples": e.samples[0]} | ({"audit": e.audit[0]} if "audit" in e.data else {})
-    if "recording" in e.data:
-        points["calibration"] = e.arrays["held.z"]
+    if kind == "none" and any(np.any(e.arrays.get(f"predictor.{k}", 0.0)) for k in ("offset", "slope")):
+        return "a predictor is stored, and none is stated"
+    if "remainder.resolution" not in e.arrays:
+        return None
+    e_p = np.maximum(e.arrays["remainder.resolution"] - e.arrays["resolution"], 0.0)
+    points: dict[str, Callable[[], Array]] = {
+        "samples": lambda: e.samples[0],
+        "audit": lambda: e.audit[0],
+        "calibration": lambda: _calibrated(e),
+    }
     for name, z in points.items():
-        if (np.abs(p(z) - e.arrays[f"predictor.{name}"]) > 2 * e_p).any():
-            return f"predictor.{name} is not what the extended model gives"
-    return ""
+        if (stored := e.arrays.get(f"predictor.{name}")) is not None:
+            own = predictor(e, o)(z()) if kind == "model" else predicted_by(e, z(), "").mid
+            if stored.shape != own.shape or not (np.abs(own - stored) <= 2 * e_p + 4 * np.spacing(np.abs(own))).all():
+                return f"predictor.{name} is not what the predictor gives"
+    return _affine(e) if kind == "affine" == o.asked["family"].predictor else ""
+
+
+def _calibrated(e: Evidence) -> Array:
+    return e.arrays["held.z"] if "recording" in e.data else e.round(calibrations(e)[0])[0]
 
 
 def _affine(e: Evidence) -> str:
@@ -480,7 +509,8 @@ def again(e: Evidence, o: Origin, n: int) -> tuple[str, str]:
 CHECKS: tuple[tuple[str, Check], ...] = (
     ("names, ranges and level are those that the spec asks for", question),
     ("constants come from what the spec asks for", constants),
-    ("the predictor is the model that the spec names", predicted),
+    ("the predictor is the one that the spec asks for", predicted),
+    ("r and r − p are known as closely as f, p and what was measured allow", resolved),
     ("e of f and f̂ is known as it is said to be", arithmetic),
     ("residuals and e are those of the spec's f and f̂, stepped again", stepped),
     ("hidden state and inputs do what is said of them", gates),
