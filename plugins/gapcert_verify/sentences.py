@@ -418,7 +418,8 @@ def copies(e: Evidence) -> str:
     if not (found := [*whole, *parts]):
         return ""
     named = [f"'{c['name']}' {'is a copy ' if k == 0 else ''}of '{c['of']}'" for k, c in enumerate(whole)]
-    named += [f"'{c['name']}' has {c['rows']} rows from {c['start']:.6g} s on that are a copy of rows of '{c['of']}'" for c in parts]
+    part = "'{name}' has {rows} rows from {start:.6g} s on that are a copy of rows of '{of}'"
+    named += [part.format(**c) for c in parts]
     rest = [f"and {len(named) - NAMED} more"] if len(named) > NAMED else []
     has, have = ("has rows that are", "have rows that are") if parts else ("is", "are")
     count = len({c["name"] for c in found})

@@ -145,7 +145,7 @@ def declared(problem: GapProblem, gap: GapFunction, residual: Residual, assumed:
 
 
 def by_audit(problem: GapProblem, z: Array, r: Array, most: int = 16_000_000) -> dict[str, Any] | None:
-    """Two of some `most` pairs of a point of the audit and a sample that contradict declared constants or a symmetry, or None."""
+    """A point of the audit and a sample, of `most` such pairs, that contradict declared constants or a declared symmetry."""
     if problem.lipschitz.provenance != "declared" and problem.symmetry is None:
         return None
     own, count = problem.samples, min(most // len(z) + 1, len(problem.samples))
