@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from gapcert.contracts.plugins.events import Emit, Event
 
 GROUP = "gapcert"
+_title = functools.cache(lambda dist: f"{dist.name} {dist.version}")  # reads the metadata anew whenever it is asked
 _OWN = f"gapcert {__version__}"
 
 hookspec = pluggy.HookspecMarker("gapcert")
@@ -180,7 +181,7 @@ def _tell(implementation: pluggy.HookImpl, event: Event) -> None:
 
 
 def _owner(point: importlib.metadata.EntryPoint) -> str:
-    return f"{point.dist.name} {point.dist.version}" if point.dist is not None else "unknown"
+    return "unknown" if point.dist is None else _title(point.dist)
 
 
 BUILTIN = (
