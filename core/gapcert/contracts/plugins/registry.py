@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from gapcert.contracts.plugins.events import Emit, Event
 
 GROUP = "gapcert"
-_title = functools.cache(lambda dist: f"{dist.name} {dist.version}")  # reads the metadata anew whenever it is asked
 _OWN = f"gapcert {__version__}"
 
 hookspec = pluggy.HookspecMarker("gapcert")
@@ -161,17 +160,17 @@ def discover(entry_points: Iterable[importlib.metadata.EntryPoint]) -> Registry:
     manager = pluggy.PluginManager("gapcert")
     manager.add_hookspecs(sys.modules[__name__])
     components, broken = [replace(c, distribution=_OWN) for c in BUILTIN], []
-    for point in sorted(entry_points, key=lambda p: (_owner(p), p.name)):
+    for owner, point in sorted(((_owner(p), p) for p in entry_points), key=lambda pair: (pair[0], pair[1].name)):
         try:
             module = point.load()
             # Keyed by distribution as well: two distributions may use one entry-point name without shadowing each other.
-            manager.register(module, name=f"{_owner(point)}:{point.name}")
-            declared = [replace(c, distribution=_owner(point)) for c in getattr(module, "gapcert_components", list)()]
+            manager.register(module, name=f"{owner}:{point.name}")
+            declared = [replace(c, distribution=owner) for c in getattr(module, "gapcert_components", list)()]
             if strange := {c.kind for c in declared} - {*KINDS, *INNER}:
                 raise UsageError(f"a component of unknown kind '{min(strange)}'; kinds are {', '.join(KINDS)}")
             components += declared
         except (Exception, SystemExit) as error:  # a third party's import may fail in any way; the program must not
-            broken.append(Broken(_owner(point), point.name, f"{type(error).__name__}: {error}"))
+            broken.append(Broken(owner, point.name, f"{type(error).__name__}: {error}"))
     return Registry(components, broken, manager)
 
 
@@ -181,7 +180,7 @@ def _tell(implementation: pluggy.HookImpl, event: Event) -> None:
 
 
 def _owner(point: importlib.metadata.EntryPoint) -> str:
-    return "unknown" if point.dist is None else _title(point.dist)
+    return f"{point.dist.name} {point.dist.version}" if point.dist is not None else "unknown"
 
 
 BUILTIN = (
