@@ -43,7 +43,6 @@ ACROBOT = (
     )
     + "</robot>"
 )
-BOX = '<collision><origin xyz="0 0 -0.5"/><geometry><box size="0.1 0.1 1"/></geometry></collision>'
 FOUR = {"a": "shoulder.position", "b": "elbow.position", "da": "shoulder.velocity", "db": "elbow.velocity"}
 
 
@@ -270,13 +269,41 @@ def test_any_order_gives_the_same_bits_past_a_joint_limit(tmp_path):
     assert np.abs(y - free).max() > 1e-3
 
 
-def test_contacts_do_not_carry_over(tmp_path):
-    text = ACROBOT.replace("</inertial></link>", "</inertial>" + BOX + "</link>")
-    b = build(tmp_path, text, states=FOUR, inputs={"torque": "elbow"}, self_collision=True, substeps=5)
+FINGER = (
+    '<link name="{0}"><inertial><origin xyz="0 0 0.2"/><mass value="0.5"/><inertia ixx="0.007" iyy="0.007" izz="0.0003" '
+    'ixy="0" ixz="0" iyz="0"/></inertial><collision><origin xyz="0 0 0.2"/><geometry><box size="0.03 0.03 0.4"/></geometry>'
+    '</collision></link><joint name="{0}" type="continuous"><parent link="palm"/><child link="{0}"/><origin xyz="{1} 0 0"/>'
+    '<axis xyz="0 1 0"/></joint>'
+)
+CLAW = f'<robot name="claw"><link name="palm"/>{FINGER.format("left", -0.15)}{FINGER.format("right", 0.15)}</robot>'
+
+
+def claw(tmp_path, **options):
+    states = {"l": "left.position", "l_dot": "left.velocity", "r": "right.position", "r_dot": "right.velocity"}
+    return build(tmp_path, CLAW, states=states, inputs={"torque": "left"}, gravity=(0.0, 0.0, 0.0), **options)
+
+
+@pytest.mark.parametrize("substeps", [1, 4])
+def test_rods_of_one_robot_meet_where_they_may_and_forget_it(tmp_path, substeps):
+    closing, still = np.array([[0.0, 0.9, 0.0, -0.7]]), np.zeros((1, 300, 1))
+    through = claw(tmp_path, substeps=substeps).rollout(closing, still).x[0]
+    assert through[-1, 0] > 1.0
+    assert through[-1, 2] < -0.8
+    b = claw(tmp_path, substeps=substeps, self_collision=True)
     assert b.tiling == "untiled: collision shapes take part in the physics"
-    x, u = query(60, 4, scale=3.0)
-    order = np.random.default_rng(1).permutation(len(x))
-    assert (b.step(x, u).x[order] == b.step(x[order], u[order]).x).all()
+    met = b.rollout(closing, still).x[0]
+    # Tips 0.3 m apart at first, of rods of 0.4 m with half a width of 0.015 m: both lean by 0.34 rad where they touch.
+    assert (met[:, 0] - met[:, 2]).max() < 0.8
+    rng = np.random.default_rng(2)
+    x, u = rng.uniform([0.2, -2, -0.6, -2], [0.6, 2, -0.2, 2], (80, 4)), rng.uniform(-1, 1, (80, 1))
+    y = b.step(x, u).x
+    assert (np.abs(y - claw(tmp_path, substeps=substeps).step(x, u).x).max(axis=1) > 1e-6).sum() > 8
+    order = rng.permutation(len(x))
+    assert (b.step(x[order], u[order]).x == y[order]).all()
+    for close in (1e-1, 1e-3, 1e-6, 1e-10):
+        near = x + close * rng.uniform(-1, 1, x.shape)
+        pairs = [b.step(np.stack(rows), np.stack([v, v])).x[1] for *rows, v in zip(near, x, u, strict=True)]
+        assert (np.array(pairs) == y).all()
 
 
 def test_threads_share_one_instance():

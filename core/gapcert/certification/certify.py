@@ -156,7 +156,7 @@ def measure(question: Question, store: Store, gate: Gate) -> GapProblem:
     domain, sampling, seed, symmetries = question.domain, question.sampling, question.seed, question.symmetries
     residual = store.residual
     # |r(z, h) − r(z′, h′)| ≤ L |z − z′| + 2 (e + s): the spread s over hidden states acts as a further resolution.
-    both = residual.arithmetic(domain)
+    both = residual.arithmetic(domain, gate.jitter if question.route.constants else None)
     rounding = both[0].e + both[1].e
     e = rounding + gate.bound
     for message in named(*both, [s.name for s in residual.model.states]):

@@ -43,11 +43,10 @@ class Thresholds:
     repeat_error: float = chosen(64.0, "times what a step rounds by, that it may change with a turn: sums round more than once")
     purity_rows: int = chosen(21, "that are asked again in other company; with the centre and three ladders they are 64")
     purity_rungs: int = chosen(14, "of a ladder of close rows: from its length down to 6e-7 of it")
+    jitter_rows: int = chosen(32, "points, each asked at fifteen places some ulp apart: no more than other probes ask")
     small_call: int = chosen(64, "rows of the largest of an audit's small calls")
     small_calls_rows: int = chosen(1_500, "of an audit, at most, that are asked in small calls, which cost an engine more")
-    again_rows: int = chosen(
-        64, "of the samples and of the audit, each, that are asked again alone: more cost a certificate time"
-    )
+    again_rows: int = chosen(64, "of the samples and of the audit, each, that are asked again alone: more cost time")
     held_periods: int = chosen(512, "at most, that one row is asked in a row: a counter in a system shows by then")
     response_error: float = chosen(0.1, "relative, between what an input moves in f̂ and in f: a warning, no refusal")
     response_rows: int = chosen(16, "states at which an input is moved from end to end")
@@ -58,12 +57,9 @@ class Thresholds:
     question_orders: int = chosen(720, "of axes with equal ranges, those of six: after so many a question is the same")
     question_range: float = threshold(1e-9, "of the width, as the design has it: closer ranges are one")
     question_draws: int = chosen(16, "of noise at each point")
-    question_noise: float = threshold(
-        0.5, "deviations: by the formula, means of 16 draws at 64 points differ by less than four"
-    )
+    question_noise: float = threshold(0.5, "deviations: by the formula, means of 16 draws at 64 points differ by less")
     question_spread: float = threshold(0.05, "by the formula: spreads of 1024 draws differ by less than four times this share")
     question_shared: float = chosen(0.05, "of its hashes: recordings that have so many in common are one")
-    # samples
     # samples
     spread_grid: int = chosen(300, "points of a grid where nobody asks for another")
     refinement_rounds: int = chosen(8, "at most 9, since names of rounds are sorted as texts")

@@ -7,6 +7,7 @@ state of the comparison, over a declared range.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from functools import partialmethod
 from typing import Any, final
 
 import numpy as np
@@ -199,47 +200,27 @@ class Resting(Model):
     def _step(self, x: Array, u: Array, **options: Any) -> Array:
         return self.model.step(x, u, **options).x
 
-    def jacobian(self, x: Array, u: Array) -> Array:
-        return self.model.jacobian(x, u)
+    def _asked(self, name: str, *given: Any) -> Any:
+        return getattr(self.model, name)(*given)
 
-    def enclosure(self, z: Interval) -> Interval:
-        return self.model.enclosure(z)
-
-    def jacobian_enclosure(self, z: Interval) -> Interval:
-        return self.model.jacobian_enclosure(z)
-
-    def curvature_enclosure(self, z: Interval, axis: int) -> Interval:
-        return self.model.curvature_enclosure(z, axis)
-
-    def output(self, x: Array, u: Array, parameters: Mapping[str, Array | float] | None = None) -> Array:
-        return self.model.output(x, u, parameters)
-
-    def resolution(self, magnitude: Array) -> Array:
-        return self.model.resolution(magnitude)
-
-    def rounding_over(self, z: Interval) -> Array | None:
-        return self.model.rounding_over(z)
-
-    def rounding_terms(self, z: Interval) -> tuple[str, ...]:
-        return self.model.rounding_terms(z)
+    jacobian: Any = partialmethod(_asked, "jacobian")
+    enclosure: Any = partialmethod(_asked, "enclosure")
+    jacobian_enclosure: Any = partialmethod(_asked, "jacobian_enclosure")
+    curvature_enclosure: Any = partialmethod(_asked, "curvature_enclosure")
+    output: Any = partialmethod(_asked, "output")
+    resolution: Any = partialmethod(_asked, "resolution")
+    rounding_over: Any = partialmethod(_asked, "rounding_over")
+    rounding_terms: Any = partialmethod(_asked, "rounding_terms")
+    equations: Any = partialmethod(_asked, "equations")
+    to_spec: Any = partialmethod(_asked, "to_spec")
+    sites: Any = partialmethod(_asked, "sites")
+    force_unit: Any = partialmethod(_asked, "force_unit")
 
     def digest(self) -> str:
         return json_digest(type(self).__qualname__, self.model.digest())
 
     def extend(self, extensions: Sequence[Extension]) -> Model:
         return Resting(self.model.extend(extensions))
-
-    def equations(self) -> str:
-        return self.model.equations()
-
-    def to_spec(self) -> dict[str, Any]:
-        return self.model.to_spec()
-
-    def sites(self, kind: str) -> tuple[str, ...]:
-        return self.model.sites(kind)
-
-    def force_unit(self, site: str) -> str | None:
-        return self.model.force_unit(site)
 
 
 @final

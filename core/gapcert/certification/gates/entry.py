@@ -22,6 +22,10 @@ from gapcert.contracts.systems.system import Model, System, difference
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.errors import UsageError
 
+_ULPS = np.sort([0.0, *np.outer([-1.0, 1.0], [1.0, 4.0, 16.0, 64.0, 400.0, 1e4, 1e6]).ravel()])
+_FOURS = np.array([*itertools.combinations(range(len(_ULPS)), 4)])
+_DIVIDED = 1 / (_ULPS[_FOURS][:, :, None] - _ULPS[_FOURS][:, None] + np.eye(4)).prod(axis=2)
+
 
 def contain(model: Model, domain: Domain) -> None:
     """UsageError where a domain goes to where the model no longer holds."""
@@ -64,7 +68,25 @@ def enter(
     warnings = tuple(responses(Residual(gate.system, model), domain, seed))
     for warning in warnings:
         emit(Event("warning", "gates", {"message": warning}))
-    return replace(gate, purity=probed, warnings=warnings, first=first)
+    return replace(gate, purity=probed, warnings=warnings, first=first, jitter=jitter(backend, domain, seed))
+
+
+def jitter(system: System, domain: Domain, seed: int) -> Array | None:
+    """(nx,): how far x⁺ is from the best parabola over z ± 1 to 10⁶ ulp, at most, at points of Z; None of text or rotations.
+
+    f̂ itself is one there, and |Σ w_k y_k| ≤ e Σ |w_k| for the weights w of the third divided difference of any four answers.
+    """
+    text = isinstance(system, Model) and system.rounding_over(domain.interval) is not None
+    if text or "quaternion" in [s.kind for s in system.states]:
+        return None
+    rng = np.random.default_rng([seed, 0x177E])
+    z = domain.draw(THRESHOLDS.jitter_rows, rng)
+    step = np.spacing(np.abs(z)) * rng.choice([-1.0, 1.0], z.shape)
+    near = (z[:, None] + _ULPS[:, None] * step[:, None]).reshape(-1, z.shape[1])
+    x = system.step(*map(np.ascontiguousarray, domain.split(near))).x
+    y = difference(system.states, x, x[:: len(_ULPS)].repeat(len(_ULPS), axis=0)).reshape(len(z), len(_ULPS), -1)
+    off = np.abs((y[:, _FOURS] * _DIVIDED[..., None]).sum(axis=2)) / np.abs(_DIVIDED).sum(axis=1)[:, None]
+    return np.asarray(off.max(axis=(0, 1)))
 
 
 def responses(residual: Residual, domain: Domain, seed: int) -> list[str]:

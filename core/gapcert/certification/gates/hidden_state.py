@@ -99,7 +99,7 @@ class Gate:
 
     `system` is what is sampled, `bound` (nx,) the spread that acts as further resolution; it cost `spent` transitions.
     `audited`, if set, is asked by the audit instead: hidden state that a probe found harmless is drawn there all the same.
-    `first`: see `purity.answered`.
+    `first`: see `purity.answered`; `jitter`: see `entry.jitter`.
     """
 
     plan: HiddenPlan
@@ -116,6 +116,7 @@ class Gate:
     attack: Mapping[str, Any] = field(default_factory=dict)
     audited: System | None = None
     first: Any = None
+    jitter: Array | None = None
 
     @property
     def distribution(self) -> str:

@@ -43,9 +43,9 @@ class Residual:
         """e (nx,): bound on |computed r − r| over Z, from both arithmetics."""
         return np.asarray(sum(a.e for a in self.arithmetic(domain)))
 
-    def arithmetic(self, domain: Domain) -> tuple[Arithmetic, Arithmetic]:
-        """Those of f̂ and of f on Z."""
-        return Arithmetic.of(self.backend, domain), Arithmetic.of(self.model, domain)
+    def arithmetic(self, domain: Domain, jitter: Array | None = None) -> tuple[Arithmetic, Arithmetic]:
+        """Those of f̂, covering its jitter (nx,) where that is known, and of f on Z."""
+        return Arithmetic.of(self.backend, domain).covering(jitter), Arithmetic.of(self.model, domain)
 
 
 @final

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, final
 from weakref import ref
 
@@ -26,11 +26,13 @@ class Arithmetic:
     """e (nx,) of one System on Z, see `Model.rounding_over`; `proved`, or an assumption.
 
     terms: per state the term whose rounding has the largest share, empty where e is as small as the state's own last digits.
+    jitter (nx,): of an engine, by how much answers a few ulp apart left a parabola; e covers twice that.
     """
 
     e: Array
     proved: bool = False
     terms: tuple[str, ...] = ()
+    jitter: Array | None = None
 
     @classmethod
     def of(cls, system: System, domain: Domain) -> Arithmetic:
@@ -59,24 +61,36 @@ class Arithmetic:
         worst = ("",) * len(e) if plain.all() else system.rounding_terms(boxes[(bound / e).max(axis=1).argmax()][None])
         return cls(e, True, tuple("" if small else term for small, term in zip(plain, worst, strict=True)))
 
+    def covering(self, jitter: Array | None) -> Arithmetic:
+        """With e no less than twice what was seen at some points of Z."""
+        return self if jitter is None else replace(self, e=np.maximum(self.e, 2 * jitter), jitter=jitter)
+
     def to_data(self) -> dict[str, Any]:
         """JSON-able."""
-        return {"e": self.e.tolist(), "proved": self.proved, "terms": list(self.terms)}
+        seen = {} if self.jitter is None else {"jitter": self.jitter.tolist()}
+        return {"e": self.e.tolist(), "proved": self.proved, "terms": list(self.terms), **seen}
 
 
 def sentence(backend: Arithmetic, model: Arithmetic, names: Sequence[str]) -> str:
     """What both are within, and what of that is proved."""
-    proved, stated = "is proved by a running error analysis of the equations", "is assumed as it is stated, not proved"
     each = ", ".join(f"e({n}) = {e:.2g}" for n, e in zip(names, backend.e + model.e, strict=True))
-    each_how = [proved if a.proved else stated for a in (backend, model)]
-    how = f"of both it {each_how[0]}" if len({*each_how}) == 1 else "of f̂ it {}, and of f it {}".format(*each_how)
+    here, there = _known(model), _known(backend)
+    how = f"of both it {here}" if here == there else f"of f̂ it {there}, and of f it {here}"
     one = f"One step of f̂ and of f, as computed, is within e of its exact value: {each}; {how}."
     return " ".join([one, *named(backend, model, names)])
 
 
+def _known(a: Arithmetic) -> str:
+    if a.jitter is not None:
+        far = f"twice what answers a few ulp apart left a parabola by, {a.jitter.max(initial=0.0):.2g} at most"
+        return f"is measured, not proved: it covers {far}"
+    return "is proved by a running error analysis of the equations" if a.proved else "is assumed as it is stated, not proved"
+
+
 def named(backend: Arithmetic, model: Arithmetic, names: Sequence[str]) -> list[str]:
-    """Terms with which text cancels badly."""
-    return [
+    """Terms with which text cancels badly, and states of f̂ that jitter by more than is stated."""
+    seen = zip(names, backend.e, () if backend.jitter is None else backend.jitter, strict=False)
+    return [f"e({n}) of f̂ is twice its jitter, which is more than is stated." for n, e, j in seen if e == 2 * j > 0] + [
         f"Most of e({n}) is the rounding of {term} in {of}."
         for of, a in (("f̂", backend), ("f", model))
         for n, term in zip(names, a.terms, strict=False)
