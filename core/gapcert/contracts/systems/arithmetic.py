@@ -16,8 +16,7 @@ from gapcert.contracts.thresholds import THRESHOLDS
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.intervals import Interval
 
-_KNOWN = deque[tuple[Any, Any, "Arithmetic"]](maxlen=4)
-"""What was asked last: gates, questions and margins ask the same of one pair of systems."""
+_KNOWN = deque[tuple[Any, Any, "Arithmetic"]](maxlen=4)  # gates, questions and margins ask the same of one pair of systems
 
 
 @final
