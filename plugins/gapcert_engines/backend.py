@@ -70,7 +70,10 @@ class EngineBackend(Backend):
         return hashlib.sha256(json.dumps(data).encode()).hexdigest()
 
     def resolution(self, magnitude: Array) -> Array:
-        return np.maximum(self.engine.resolution(magnitude), self.period * self.engine.unsolved)
+        return np.maximum(self.rounding(magnitude), self.period * self.engine.unsolved)
+
+    def rounding(self, magnitude: Array) -> Array:
+        return self.engine.resolution(magnitude)
 
     def __getstate__(self) -> dict[str, Any]:
         return {k: v for k, v in self.__dict__.items() if k not in ("_worlds", "_lock")}

@@ -85,10 +85,13 @@ class FmuBackend(Backend):
 
     def resolution(self, magnitude: Array) -> Array:
         """4 ulp, and what the tolerance of a solver of the FMU's own leaves."""
-        rounding = super().resolution(magnitude)
+        rounding = self.rounding(magnitude)
         if self._tolerance is None or self.description.interface != "co-simulation":
             return rounding
         return np.asarray(np.maximum(rounding, self._tolerance * np.maximum(np.abs(magnitude), self._wiring.nominal)))
+
+    def rounding(self, magnitude: Array) -> Array:
+        return super().resolution(magnitude)
 
     def __getstate__(self) -> dict[str, Any]:
         return {k: v for k, v in self.__dict__.items() if k not in ("_instance", "_lock", "_folder", "description")}

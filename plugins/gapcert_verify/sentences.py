@@ -223,16 +223,25 @@ def _resolution(e: Evidence) -> Iterator[Said]:
 
 def _within(both: Sequence[Mapping[str, Any]]) -> str:
     """How it is known of f̂ and of f."""
-    proved, stated = "is proved by a running error analysis of the equations", "is assumed as it is stated, not proved"
-    fhat, f = (proved if a["proved"] else stated for a in both)
+    fhat, f = map(_known, both)
     return f"of both it {f}" if fhat == f else f"of f̂ it {fhat}, and of f it {f}"
 
 
+def _known(a: Mapping[str, Any]) -> str:
+    if "jitter" in a:
+        return (
+            f"is measured, not proved: twice what answers a few ulp apart leave a parabola by, {max(a['jitter']):.2g} at most"
+        )
+    return "is proved by a running error analysis of the equations" if a["proved"] else "is assumed as it is stated, not proved"
+
+
 def _terms(e: Evidence, both: Sequence[Mapping[str, Any]]) -> str:
-    """Terms with which text cancels badly."""
+    """Terms with which text cancels badly, and states of f̂ that jitter by more than is stated."""
     systems = zip(("f̂", "f"), both, strict=True)
     each = ((n, term, of) for of, a in systems for n, term in zip(states(e), a["terms"], strict=False) if term)
-    return "".join(f" Most of e({n}) is the rounding of {term} in {of}." for n, term, of in each)
+    seen = zip(states(e), both[0]["e"], both[0].get("jitter", ()), strict=False)
+    told = [f" e({n}) of f̂ is twice its jitter, which is more than is stated." for n, own, j in seen if own == 2 * j > 0]
+    return "".join([*told, *(f" Most of e({n}) is the rounding of {term} in {of}." for n, term, of in each)])
 
 
 def _purity(e: Evidence) -> Iterator[Said]:

@@ -250,6 +250,7 @@ def test_a_tolerance_is_the_resolution():
     assert (backend().resolution(np.ones(2)) < 1e-14).all()
     b = backend(tolerance=1e-6)
     assert (b.resolution(np.ones(2)) == 1e-6).all()
+    assert (b.rounding(np.ones(2)) < 1e-14).all()
 
 
 # Code of a stranger

@@ -346,7 +346,8 @@ def arithmetic(e: Evidence, o: Origin) -> str | None:
     if (stated := e.data.get("arithmetic")) is None:
         return "how e is known is left out"
     if o.whole:
-        made = [a.to_data() for a in o.residual.arithmetic(o.domain)]
+        seen = stated[0].get("jitter")
+        made = [a.to_data() for a in o.residual.arithmetic(o.domain, None if seen is None else np.array(seen))]
     else:
         made = [stated[0], Residual(o.model, o.model).arithmetic(o.domain)[1].to_data()]
         if stated[0]["proved"] and o.build.spec.component("backend").kind != "model":

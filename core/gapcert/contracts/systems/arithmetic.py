@@ -66,8 +66,8 @@ class Arithmetic:
 
     def to_data(self) -> dict[str, Any]:
         """JSON-able."""
-        seen = {} if self.jitter is None else {"jitter": self.jitter.tolist()}
-        return {"e": self.e.tolist(), "proved": self.proved, "terms": list(self.terms), **seen}
+        seen = {"proved": self.proved, "terms": list(self.terms)}
+        return {"e": self.e.tolist(), **seen} | ({} if self.jitter is None else {"jitter": self.jitter.tolist()})
 
 
 def sentence(backend: Arithmetic, model: Arithmetic, names: Sequence[str]) -> str:
@@ -81,8 +81,7 @@ def sentence(backend: Arithmetic, model: Arithmetic, names: Sequence[str]) -> st
 
 def _known(a: Arithmetic) -> str:
     if a.jitter is not None:
-        far = f"twice what answers a few ulp apart left a parabola by, {a.jitter.max(initial=0.0):.2g} at most"
-        return f"is measured, not proved: it covers {far}"
+        return f"is measured, not proved: twice what answers a few ulp apart leave a parabola by, {a.jitter.max():.2g} at most"
     return "is proved by a running error analysis of the equations" if a.proved else "is assumed as it is stated, not proved"
 
 

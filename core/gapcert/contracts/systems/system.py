@@ -127,6 +127,10 @@ class System(ABC):
         """
         return np.asarray(4 * np.spacing(np.maximum(np.abs(magnitude), np.finfo(float).tiny)))
 
+    def rounding(self, magnitude: Array) -> Array:
+        """The part of `resolution` (nx,) that is arithmetic, without what a solver that iterates may leave (default: all)."""
+        return self.resolution(magnitude)
+
     def repeats(self, angle: str) -> str | None:
         """Why f(x + 2π, u) = f(x, u) along this state, up to whole turns of angles, is not true (of what is remembered too);
         empty where it is proved to be, and None where nothing is known: it is probed then.
