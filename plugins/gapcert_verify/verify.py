@@ -432,6 +432,7 @@ def _witnessed(e: Evidence, low: Interval, high: Interval) -> str:
     k, i = int(rows[0]), w["state"]
     excess = np.maximum(low.mid - r, r - high.mid)
     slack = 64 * np.spacing(np.abs([low.mid, high.mid]).max(axis=0)) + e.arrays["remainder.resolution"]
+    slack += np.maximum(low.hi - low.lo, high.hi - high.lo)
     same = abs(w["low"] - low.mid[k, i]) <= slack[k, i] and abs(w["high"] - high.mid[k, i]) <= slack[k, i]
     largest = excess[k, i] >= (excess - slack).max()
     return "" if same and largest and w["residual"] == r[k, i] else "the witness is another point, or leaves by less"

@@ -361,7 +361,7 @@ BANDS: dict[str, dict[str, Any]] = {
         "sampling": {"kind": "lattice", "budget": 60},
         "lipschitz": {"residual": {"kind": "interval", "curvature": True}},
     },
-    "cells": {"lipschitz": {"residual": {"kind": "piecewise"}}},
+    "cells": {"lipschitz": {"residual": {"kind": "piecewise"}}, "gap": {"kind": "envelope", "predictor": "none"}},
     "calibrated": {"certificate": SPEC["certificate"] | {"route": "calibrate"}},
 }
 
