@@ -114,7 +114,8 @@ class Stream:
             lost = True
         finally:
             self.recording.disconnect()
-            lost = lost or not late.is_alive()
+            # One that is gone has not always been missed by the stream yet.
+            lost = lost or not late.is_alive() or (viewer is not None and viewer.process.poll() is not None)
             late.cancel()
             if self._over and self._aside and self._file:
                 self._aside.replace(self._file)
