@@ -251,6 +251,8 @@ sys.modules["gapcert_rerun.stream"].PATIENCE = 0.5
 viewer = plugin._STREAM.get()._viewer
 time.sleep(0.3)
 os.killpg(viewer.process.pid, getattr(signal, sys.argv[1]))
+# Which takes a process of many threads some milliseconds.
+sys.argv[1] == "SIGKILL" and viewer.process.wait(5)
 plugin.gapcert_event(gc.Event("run-finished", "run", {"summary": {"name": "n", "verdict": "holds"}}))
 viewer.process.wait(5)
 """
