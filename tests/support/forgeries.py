@@ -33,7 +33,7 @@ TRUSTED = {
     r"certificate\.json:versions\..*": "Versions, times",
     r"spec\.json:sampling\..*|spec\.json:lipschitz\.residual\.(budget|boxes|pairs|distance|cells)": "budgets of the spec",
     r"spec\.json:((closed_loop|report|expect)\..*|controller\.(horizon|weights|reference|policy).*)": "budgets of the spec",
-    r"spec\.json:model\..*": "residuals are those of it and of f|γ is what a person declares",
+    r"spec\.json:(model|backend)\..*": "residuals are those of it and of f|γ is what a person declares",
     r"summary\.json:timings\..*": "Versions, times",
     r"figures\.json:lanes\.\d+\.at\..*": "Versions, times",
     r"controller/with_gamma/controller\.json:evidence\.(levels|rounds|reason|change|gap_over_cells).*": "rounds its games took",
