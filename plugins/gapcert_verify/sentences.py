@@ -230,7 +230,7 @@ def _within(both: Sequence[Mapping[str, Any]]) -> str:
 def _known(a: Mapping[str, Any]) -> str:
     if "jitter" in a:
         return (
-            f"is measured, not proved: twice what answers a few ulp apart leave a parabola by, {max(a['jitter']):.2g} at most"
+            f"is measured, not proved: it covers twice what close answers leave a parabola by, {max(a['jitter']):.2g} at most"
         )
     return "is proved by a running error analysis of the equations" if a["proved"] else "is assumed as it is stated, not proved"
 
