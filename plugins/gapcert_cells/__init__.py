@@ -16,6 +16,7 @@ _HOME = homes(
         "gapcert_cells.ltl": "automaton_of",
         "gapcert_cells.outside": "inside_alone refusal",
         "gapcert_cells.successors": "GROWTH SEEN Along Splits Successors SuccessorsByLevel",
+        "gapcert_cells.wider_inputs": "FAR ranges sufficient",
     }
 )
 

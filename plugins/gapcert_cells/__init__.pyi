@@ -15,3 +15,6 @@ from gapcert_cells.successors import Along as Along
 from gapcert_cells.successors import Splits as Splits
 from gapcert_cells.successors import Successors as Successors
 from gapcert_cells.successors import SuccessorsByLevel as SuccessorsByLevel
+from gapcert_cells.wider_inputs import FAR as FAR
+from gapcert_cells.wider_inputs import ranges as ranges
+from gapcert_cells.wider_inputs import sufficient as sufficient

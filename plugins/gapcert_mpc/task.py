@@ -10,7 +10,8 @@ from typing import final
 
 import numpy as np
 
-from gapcert.plugin import Array, Domain, Pulse, SynthesisProblem
+from gapcert.plugin import Array, Box, Domain, Pulse, SynthesisProblem
+from gapcert_cells import FAR, ranges, sufficient
 from gapcert_mpc.thresholds import THRESHOLDS
 
 from .config import MpcConfig
@@ -106,6 +107,25 @@ class Task:
         """The controller that wins nowhere."""
         evidence = self.problem.basis | {"reason": reason, "domain_fraction": 0.0}
         return MpcController(self.problem.goal, None, evidence)
+
+    def weak(self, reason: str, enough: Callable[[Task], bool]) -> MpcController:
+        """`nothing`, with what is to blame where that is the inputs: whether γ = 0 would do, else the ranges that then suffice.
+
+        enough: is there a controller for a task that differs in its inputs, and has no gap?
+        """
+        problem, domain = replace(self.problem, gap=None), self.problem.domain
+
+        def held(inputs: Box) -> bool:
+            return enough(replace(self, problem=replace(problem, domain=replace(domain, inputs=inputs))))
+
+        if held(domain.inputs):
+            return self.nothing(reason)
+        if (wider := sufficient(held, domain.inputs)) is None:
+            return self.nothing(f"{reason}; for γ = 0, inputs {FAR} times as wide do not help either")
+        names = " and ".join(domain.inputs.names)
+        told = f"the inputs are too weak, for γ = 0 too, where {ranges(wider, domain.inputs)} suffices"
+        made = self.nothing(f"{names}: {told}; {reason}")
+        return replace(made, evidence=made.evidence | {"change": {"inputs": wider.bounds}})
 
     def unbounded(self, stages: Stages) -> str | None:
         """Why there can be no tube at all."""

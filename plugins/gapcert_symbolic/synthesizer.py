@@ -13,7 +13,7 @@ import numpy as np
 
 from gapcert import Array, Box, Domain, GapFunction, Goal, MissingDependency, Model, Region, SynthesisProblem, UsageError
 from gapcert.plugin import Bools, Ints, Policy, Pulse, Synthesizer, magnitude
-from gapcert_cells import GROWTH, SEEN, AutomatonController, GridController, Successors
+from gapcert_cells import GROWTH, SEEN, AutomatonController, GridController, Successors, sufficient
 from gapcert_symbolic.thresholds import THRESHOLDS
 
 from .cells.abstraction import Windows, check_size, windows
@@ -21,7 +21,6 @@ from .cells.bounds import Bound, Enclosed, Grown, inferred
 from .cells.gaps import Disturbance, disturbance
 from .cells.grid import Grid, combined, multiples, spaced
 from .cells.held import Left, invariant, offered
-from .games.authority import sufficient
 from .games.games import Labels, solve_goal, started, usable
 from .games.reason import in_words, tried, why_empty
 from .games.refinement import Refined, refined

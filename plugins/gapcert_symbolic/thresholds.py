@@ -34,8 +34,6 @@ class Thresholds:
     change_pairs: int = chosen(10_000_000, "of a cell and an input, up to which a change is tried: each is a game")
     change_halvings: int = threshold(8, "by the formula, a factor of γ is then known to 1/256")
     drift_cells: int = chosen(4096, "over which it is asked whether a state can be held: a bound, whatever the cells are")
-    widenings: int = chosen(4, "by 1/4, 1, 4, 16 times its width: of an input's range, to learn what would suffice")
-    widening_halvings: int = chosen(5, "of the last widening: what suffices is known to 1/32 of it")
     needed_halvings: int = threshold(16, "by the formula, what is needed at the least is then known to the three digits shown")
     factors: tuple[int, int] = chosen((2, 4), "more cells per axis, that are tried")
     # solvers

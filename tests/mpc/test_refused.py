@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import pytest
 from drawn_mpc import MODES, drawn, ended
 
 import gapcert as gc
-from gapcert.plugin import SynthesisProblem
+from gapcert.plugin import Box, Goal, SynthesisProblem
 from gapcert_cells.testing import Band
+from gapcert_mpc.synthesizer import Mpc
 
 
 @pytest.mark.parametrize("seed", range(660, 660 + len(MODES)), ids=MODES)
@@ -36,3 +40,45 @@ def test_a_tube_that_is_wider_than_its_room_is_a_reason(solver: str, mode: str) 
     made = spec.build("controller").synthesize(SynthesisProblem(model, band, domain, spec.goal(domain)))
     assert made.evidence["domain_fraction"] == 0
     assert "reaches the target" in made.evidence["reason"]
+
+
+def held(pull: float, low: float, high: float, **options: Any) -> Mapping[str, Any]:
+    """A cart on a spring with pull · x against it, to be kept at 0.5 to 0.7 m."""
+    spec = {
+        "kind": "equations",
+        "states": {"x": "1", "v": "1"},
+        "inputs": {"a": "1"},
+        "next": {"x": "x + 0.1*v", "v": f"v + 0.1*(a - {pull}*x)"},
+        "period": "0.1 s",
+    }
+    known = gc.registry()
+    model = known.build("model", "equations", known.config("model", "equations").model_validate(spec))
+    zone = gc.Domain.of(model, {"x": (0.0, 1.0), "v": (-1.0, 1.0), "a": (low, high)})
+    goal = Goal("invariance", Box(model.states, (0.5, -1.0), (0.7, 1.0)))
+    return Mpc(horizon=6, **options).synthesize(SynthesisProblem(model, None, zone, goal)).evidence
+
+
+@pytest.mark.parametrize("options", [{}, {"linearisation": "successive"}], ids=["once", "successive"])
+@pytest.mark.parametrize("pull", [1.3, 3.1])
+def test_inputs_that_are_too_weak_are_told_with_what_suffices(pull: float, options: dict[str, Any]) -> None:
+    told = held(pull, -0.3, 0.3, **options)
+    assert told["domain_fraction"] == 0
+    assert told["reason"].startswith("a: the inputs are too weak, for γ = 0 too, where a in [-0.3, ")
+    low, high = told["change"]["inputs"]["a"]
+    assert low == -0.3
+    # What holds the cart at 0.5 m is the least.
+    assert 0.5 * pull <= high <= 0.5 * pull + 1.3
+    assert held(pull, low, high, **options)["domain_fraction"] > 0
+    assert "reason" in held(pull, low, 0.49 * pull, **options)
+
+
+def test_a_goal_that_no_input_keeps_is_told_after_much_wider_ones_were_tried() -> None:
+    moves = {"x": "x + v", "v": "v + 0.1*a"}
+    spec = {"kind": "equations", "states": {"x": "1", "v": "1"}, "inputs": {"a": "1"}, "next": moves, "period": "0.1 s"}
+    known = gc.registry()
+    model = known.build("model", "equations", known.config("model", "equations").model_validate(spec))
+    zone = gc.Domain.of(model, {"x": (0.0, 1.0), "v": (0.2, 0.6), "a": (-1.0, 1.0)})
+    goal = Goal("invariance", Box(model.states, (0.0, 0.2), (1.0, 0.6)))
+    told = Mpc(horizon=4).synthesize(SynthesisProblem(model, None, zone, goal)).evidence
+    assert told["domain_fraction"] == 0
+    assert told["reason"].endswith("; for γ = 0, inputs 33 times as wide do not help either")

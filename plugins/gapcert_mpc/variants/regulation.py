@@ -23,6 +23,38 @@ from gapcert_mpc.thresholds import THRESHOLDS
 
 def regulating(task: Task, like: MpcController | None = None) -> MpcController:
     """For invariance. like: a controller whose gain and solver it has, and what else need not be found again."""
+    problem, options, nominal = task.problem, task.options, task.nominal
+    design = _planned(task, like)
+    if isinstance(design, str):
+        return task.nothing(design) if like is not None else task.weak(design, _wins)
+    evidence = problem.basis | _evidence(task, design)
+    name: Name = "piqp"
+    if like is not None and like.design is not None:
+        name, design = like.solver, replace(design, tuning=replace(like.design.tuning, pieces=Tuning().pieces))
+    elif not design.successive and options.feedback == "fixed":
+        aim = design.reference[: task.frame.nx]
+        name, tuning, samples = tuned(design.program(), aim, options.solver, problem.seed, task.tell)
+        design = replace(design, tuning=tuning)
+        evidence["solver"] = {"first": name, "pieces": len(tuning.pieces), "tuned_on": samples}
+    elif options.solver != "auto":
+        name = options.solver
+    made = MpcController(problem.goal, design, {}, name, nominal=nominal if design.successive else None)
+    x = task.drawn(np.random.default_rng(problem.seed), task.starts)
+    evidence["domain_fraction"] = float(looked(made, x, problem.emit).mean())
+    return replace(made, evidence=evidence)
+
+
+def _wins(task: Task) -> bool:
+    """From one of some states at least, without a tuned solver."""
+    if isinstance(design := _planned(task), str):
+        return False
+    made = MpcController(task.problem.goal, design, {}, "piqp", nominal=task.nominal if design.successive else None)
+    x = task.drawn(np.random.default_rng(task.problem.seed), min(task.starts, THRESHOLDS.starts))
+    return bool(looked(made, x, task.problem.emit).any())
+
+
+def _planned(task: Task, like: MpcController | None = None) -> Design | str:
+    """What plans are made of, with a steady pair around which they can end; or why there is none."""
     problem, options, frame, nominal = task.problem, task.options, task.frame, task.nominal
     box, whole, rates = task.box, task.whole, limits(options.rates, problem.domain, frame.u[1])
     task.tell("successors along the model's lines")
@@ -33,7 +65,7 @@ def regulating(task: Task, like: MpcController | None = None) -> MpcController:
         constant = options.majorant != "affine" if like is None else not _follows(like)
         stages = nominal.straight(box.low, box.high, options.horizon, frame, constant, like is None)
     if (reason := task.unbounded(stages) or task.unstable(stages)) is not None:
-        return task.nothing(reason)
+        return reason
     if options.linearisation == "once":
         task.tell("gain and section of the tube")
         section, shares = _section(stages, whole, like, rates)
@@ -41,26 +73,9 @@ def regulating(task: Task, like: MpcController | None = None) -> MpcController:
             stages = nominal.straight(box.low, box.high, options.horizon, frame)
             section, shares = _section(stages, whole, like, rates)
     if not (shares < 1).all():
-        return task.nothing(_too_wide(task, section, shares))
+        return _too_wide(task, section, shares)
     task.tell("terminal set and steady state", {"largest share that the tube takes": float(np.max(shares))})
-    design = _design(task, stages, section, rates)
-    if isinstance(design, str):
-        return task.nothing(design)
-    evidence = problem.basis | _evidence(task, design)
-    name: Name = "piqp"
-    if like is not None and like.design is not None:
-        name, design = like.solver, replace(design, tuning=replace(like.design.tuning, pieces=Tuning().pieces))
-    elif not design.successive and options.feedback == "fixed":
-        aim = design.reference[: frame.nx]
-        name, tuning, samples = tuned(design.program(), aim, options.solver, problem.seed, task.tell)
-        design = replace(design, tuning=tuning)
-        evidence["solver"] = {"first": name, "pieces": len(tuning.pieces), "tuned_on": samples}
-    elif options.solver != "auto":
-        name = options.solver
-    made = MpcController(problem.goal, design, {}, name, nominal=nominal if design.successive else None)
-    x = task.drawn(np.random.default_rng(problem.seed), task.starts)
-    evidence["domain_fraction"] = float(looked(made, x, problem.emit).mean())
-    return replace(made, evidence=evidence)
+    return _design(task, stages, section, rates)
 
 
 def _follows(made: MpcController) -> bool:

@@ -13,12 +13,13 @@ import numpy as np
 
 from gapcert import Array, Box, Goal, SynthesisProblem
 from gapcert.plugin import Bools
+from gapcert_cells import FAR, ranges
 from gapcert_symbolic.cells.abstraction import Windows
 from gapcert_symbolic.cells.gaps import Disturbance
 from gapcert_symbolic.cells.grid import Grid
 from gapcert_symbolic.thresholds import THRESHOLDS
 
-from .authority import FAR, Drift, authority, drift
+from .authority import Drift, authority, drift
 from .games import Labels
 
 
@@ -118,15 +119,6 @@ def _too_weak(moved: Drift, inputs: Box) -> Cause:
         of="inputs",
         needed=needed,
     )
-
-
-def ranges(inputs: Box, other: Box) -> str:
-    """Those that differ from the other's, in words."""
-    rows = zip(inputs.axes, inputs.low, inputs.high, other.low, other.high, strict=True)
-    told = [
-        f"{axis.name} in [{a:.3g}, {b:.3g}] {axis.unit}".removesuffix(" 1") for axis, a, b, c, d in rows if (a, b) != (c, d)
-    ]
-    return " and ".join(told)
 
 
 def _gamma(added: Disturbance | None, grid: Grid) -> Array:
