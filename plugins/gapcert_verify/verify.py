@@ -154,7 +154,7 @@ def _trusted(e: Evidence, source: Origin | str | UsageError) -> list[str]:
     if "recording" in e.data:
         alike = "independent draws of one distribution" if "beta" in e.data["claim"] else "exchangeable"
         told += [
-            ("The stored transitions are all of the recording's that begin in Z, and their residuals are those of f.", True),
+            (f"The stored transitions are {_RECORDED}.", True),
             ("Which rows of the recording are copies of others is as stated.", sentences.copies(e)),
             (f"The windows, and the one that the claim is about, are {alike}, chosen before anyone looked at these.", True),
         ]
@@ -196,6 +196,7 @@ def _trusted(e: Evidence, source: Origin | str | UsageError) -> list[str]:
 
 
 _ONLY = "What only f̂ can tell, that residuals are those of it and of f"
+_RECORDED = "all of the recording's that begin in Z, measured when they are drawn to be, and their residuals are those of f"
 _NOBODY = "γ is what a person declares. No simulator was asked."
 
 

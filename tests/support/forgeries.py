@@ -46,7 +46,8 @@ TRUSTED = {
     r"samples/.*": "constants|What only f̂ can tell|stored transitions|order is trusted",
     r"certificate\.npz:(lipschitz|curvature.*|cells.*)": "constants",
     r"certificate\.json:warnings.*": "warned of slopes",
-    r"certificate\.npz:(held|fit)\..*|certificate\.json:recording\.rows\..*|spec\.json:recording\..*": "stored transitions",
+    r"certificate\.npz:(held|fit)\..*|certificate\.json:recording\.rows\..*": "stored transitions",
+    r"spec\.json:recording\..*|figures\.npz:/recorded/.*/t": "stored transitions",
 }
 """Of which subjects (as patterns of `Forgery.subject`) a sentence of `trusted` speaks, as a pattern of that sentence."""
 
@@ -68,6 +69,8 @@ class Forgery:
         if found["verdict"] == "fails":
             return ""
         phrases = [phrase for pattern, phrase in TRUSTED.items() if re.fullmatch(pattern, self.subject)]
+        if isinstance(self.was, str) and self.was.startswith("f̂ is a function of its arguments alone"):
+            phrases.append("How f̂ answered|What only f̂ can tell")
         told = any(re.search(phrase, sentence) for phrase in phrases for sentence in found["trusted"])
         return "" if told else f"{self.subject}: {self.was!r} → {self.now!r} was accepted; trusted: {found['trusted']}"
 

@@ -221,7 +221,7 @@ def constants(e: Evidence, o: Origin) -> str | None:
         return f"safety is stated as {stated['safety']}, and the spec asks for {getattr(made, 'safety', 1.0)}"
     if any(s["safety_factor"] != stated["safety"] for s in e.data["states"].values()):
         return "a state has another safety factor than the constants"
-    needed = made.provenance == "declared" or (made.provenance == "interval" and o.text)
+    needed = name == "none" or made.provenance == "declared" or (made.provenance == "interval" and o.text)
     return _again(e, o, made) if needed and e.data["predictor"] != "multilinear" else ""
 
 
@@ -251,7 +251,7 @@ def _again(e: Evidence, o: Origin, estimator: Any) -> str:
         s = e.data["symmetry"]
         found = Symmetry(tuple(s["names"]), held, s["pairs"], tuple(s["deviation"])).applied(found, p, domain)
     arrays = {"lipschitz": found.value} | ({} if found.cells is None else found.cells.arrays())
-    arrays |= {} if found.curvature is None else {"curvature": found.curvature}
+    arrays |= {} if found.curvature is None or "recording" in e.data else {"curvature": found.curvature}
     for name, value in arrays.items():
         own = e.arrays.get(name)
         if own is None or own.shape != value.shape or not np.allclose(own, value, rtol=_SAME, atol=0.0):

@@ -30,6 +30,8 @@ def figures(e: Evidence, o: Origin) -> str | None:
         return None
     with np.load(e.folder / "figures.npz", allow_pickle=False) as stored:
         arrays = {name: stored[name] for name in stored.files}
+    if other := next((k for k, v in drawn.items() if v and k not in _DRAWN), ""):
+        return f"a figure of {other} is drawn, and a certificate has none"
     if text := _lanes(e, drawn) or (_gap(e, o, drawn["gap"], arrays) if drawn["gap"] else ""):
         return text
     if drawn["recorded"] and (text := _recorded(e, drawn["recorded"], arrays)):
@@ -39,6 +41,7 @@ def figures(e: Evidence, o: Origin) -> str | None:
     return _loop(e, drawn["loop"], arrays) if drawn["loop"] else ""
 
 
+_DRAWN = ("lanes", "gap", "recorded", "winning", "loop")
 _STATE = re.compile(r"running|done|finished|holds|fails|unknown|claimed|\d+ violations")
 _STAGE = re.compile(
     r"run|report|gates|sampling|certificate|lipschitz|fit|calibration|audit|attack|recording|controller|closed_loop|pictures|beside-[\w-]+"
