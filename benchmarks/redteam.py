@@ -24,6 +24,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +97,7 @@ def attack(wanted: Sequence[tuple[str, int, int]], tries: int | None, workers: i
 def _answers(todo: Sequence[tuple[str, int, int]], tries: int | None, workers: int) -> Iterator[dict[str, Any]]:
     """As they come. Workers are replaced now and then: engines and solvers keep some memory."""
     for k in range(0, len(todo), BATCH):
-        with ProcessPoolExecutor(workers) as pool:
+        with ProcessPoolExecutor(workers, get_context("spawn")) as pool:  # a fork of JAX may hang
             for done in as_completed([pool.submit(asked, *one, tries) for one in todo[k : k + BATCH]]):
                 yield done.result()
 

@@ -99,7 +99,7 @@ class Gate:
 
     `system` is what is sampled, `bound` (nx,) the spread that acts as further resolution; it cost `spent` transitions.
     `audited`, if set, is asked by the audit instead: hidden state that a probe found harmless is drawn there all the same.
-    `first`: see `purity.answered`; `jitter`: see `entry.jitter`.
+    `first`: see `purity.answered`; `jitter`: see `entry.jitter`, none of noise that is drawn.
     """
 
     plan: HiddenPlan
