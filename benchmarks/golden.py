@@ -134,7 +134,7 @@ def worded(answer: Any) -> Any:
         return {key: worded(value) for key, value in answer.items() if key not in ("book", "witness")}
     if isinstance(answer, list):
         return [worded(value) for value in answer]
-    return answer if isinstance(answer, bool) else re.sub(r"[-+.,\d]+(e-?\d+)?", "#", str(answer))
+    return answer if isinstance(answer, bool) else re.sub(r"[0-9a-f]{16,}|[-+.,\d]+(e-?\d+)?", "#", str(answer))
 
 
 def differences(a: Any, b: Any, within: float, path: str = "") -> Iterator[str]:

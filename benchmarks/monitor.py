@@ -8,7 +8,9 @@ from __future__ import annotations
 import argparse
 import os
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 os.environ["OMP_NUM_THREADS"] = "1"
 
@@ -31,16 +33,21 @@ STEPS = 2_000
 
 def measure(options: argparse.Namespace) -> list[harness.Row]:
     with tempfile.TemporaryDirectory() as folder:
-        certificate = gc.run(SPEC, overrides=ALONE, out=folder).certificate
+        done = gc.run(SPEC, overrides=ALONE, out=folder)
+        loaded = gc.Certified.load(done.folder).monitor()
+    certificate = done.certificate
     assert certificate is not None
     assert certificate.model is not None
-    monitor, (x, u, after) = certificate.monitor(), (np.array([0.01, 0.02]), np.array([0.1]), np.array([0.0101, 0.0205]))
+    own, (x, u, after) = certificate.monitor(), (np.array([0.01, 0.02]), np.array([0.1]), np.array([0.0101, 0.0205]))
     f = certificate.model
     p, rows, inputs = {"g": 9.81, "l": 1.0, "m": 1.0, "tau": 0.005}, x[None], u[None]
 
-    def ours() -> None:
-        for _ in range(STEPS):
-            monitor.step(x, u, after)
+    def stepped(monitor: Any) -> Callable[[], None]:
+        def run() -> None:
+            for _ in range(STEPS):
+                monitor.step(x, u, after)
+
+        return run
 
     def plain() -> None:
         for _ in range(STEPS):
@@ -51,10 +58,11 @@ def measure(options: argparse.Namespace) -> list[harness.Row]:
         for _ in range(STEPS):
             f.step(rows, inputs)
 
-    case, found = "pendulum, one step", []
-    for peer, name in ((plain, "f written out in NumPy"), (model, "f as the spec's model")):
-        times = harness.alternate(ours, peer, repeats=5 if options.quick else 15)
-        found.append(harness.row(case, "time", "µs of CPU", *(1e6 * t / STEPS for t in times), name))
+    found = []
+    for case, monitor in (("pendulum, one step", own), ("pendulum, one step, of a run folder", loaded)):
+        for peer, name in ((plain, "f written out in NumPy"), (model, "f as the spec's model")):
+            times = harness.alternate(stepped(monitor), peer, repeats=5 if options.quick else 15)
+            found.append(harness.row(case, "time", "µs of CPU", *(1e6 * t / STEPS for t in times), name))
     return found
 
 

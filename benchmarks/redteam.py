@@ -24,6 +24,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -34,10 +35,12 @@ from scipy.stats import binom
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "runs" / "redteam.jsonl"
-QUICK = {"certificates": 8, "games": 8, "mpc": 2, "networks": 20, "formulas": 300, "calibrations": 2}
+QUICK = {"certificates": 8, "games": 8, "mpc": 2, "networks": 20, "formulas": 300, "calibrations": 2, "forgeries": 1}
 SIGNIFICANT, USUAL = 1e-3, 0.99
 PATIENCE = 900
 """Seconds for one claim."""
+BATCH = 200
+"""Claims that the same workers attack."""
 
 
 def commit() -> str:
@@ -76,9 +79,9 @@ def attack(wanted: Sequence[tuple[str, int, int]], tries: int | None, workers: i
     todo = [one for one in wanted if one not in known]
     results.parent.mkdir(exist_ok=True)
     began = time.monotonic()
-    with ProcessPoolExecutor(workers, max_tasks_per_child=50) as pool, results.open("a", encoding="utf-8") as file:
-        for n, done in enumerate(as_completed([pool.submit(asked, *one, tries) for one in todo]), 1):
-            row = {"commit": at, **done.result()}
+    with results.open("a", encoding="utf-8") as file:
+        for n, done in enumerate(_answers(todo, tries, workers), 1):
+            row = {"commit": at, **done}
             file.write(json.dumps(row, default=str) + "\n")
             file.flush()
             if row["broken"] or row["claim"] == "error" or n % 50 == 0 or n == len(todo):
@@ -89,6 +92,14 @@ def attack(wanted: Sequence[tuple[str, int, int]], tries: int | None, workers: i
                     else ""
                 )
                 print(f"{n} of {len(todo)}, some {left / 60:.0f} min left{broke}", file=sys.stderr, flush=True)
+
+
+def _answers(todo: Sequence[tuple[str, int, int]], tries: int | None, workers: int) -> Iterator[dict[str, Any]]:
+    """As they come. Workers are replaced now and then: engines and solvers keep some memory."""
+    for k in range(0, len(todo), BATCH):
+        with ProcessPoolExecutor(workers, get_context("spawn")) as pool:  # a fork of JAX may hang
+            for done in as_completed([pool.submit(asked, *one, tries) for one in todo[k : k + BATCH]]):
+                yield done.result()
 
 
 def kept(results: Path) -> Iterator[dict[str, Any]]:
@@ -121,7 +132,7 @@ def line(kind: str, rows: list[dict[str, Any]]) -> list[str]:
 HEAD = [
     "kind",
     "claims",
-    "points, steps, words",
+    "points, steps, words, forgeries",
     "deterministic, broken",
     "statistical, above ε",
     "empirical / refused / error",

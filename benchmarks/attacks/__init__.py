@@ -31,5 +31,6 @@ KINDS = {
     "networks": 2000,
     "formulas": 10_000,
     "calibrations": 300,
+    "forgeries": 120,
 }
 """Kind, which is the name of its module here → how many claims are drawn."""

@@ -9,17 +9,21 @@ from gapcert.lazy import LazyPackage, homes
 _HOME = homes(
     {
         "gapcert.certification.certificate": (
-            "Audit Band Certificate Record SavedStatement StateEvidence Statement domain_data figures gap_digest saved_digest"
+            "Audit Band Certificate Record SavedStatement StateEvidence Statement domain_data figures gap_digest overpowered "
+            "saved_digest"
         ),
         "gapcert.certification.certify": "predictor_of",
         "gapcert.certification.compatibility": "unmatched unpaired",
         "gapcert.certification.coordinates": "Coordinates RelativeModel in_words",
         "gapcert.certification.declaration": "Declaration",
         "gapcert.certification.fingerprint": "Fingerprint digest",
+        "gapcert.certification.contradiction": "symmetric",
         "gapcert.certification.gates.augment": "forgets widen",
+        "gapcert.certification.gates.circle": "repeating",
         "gapcert.certification.gates.hidden_distribution": "Law beginning",
-        "gapcert.certification.gates.hidden_state": "Gate",
+        "gapcert.certification.gates.hidden_state": "Gate open_gate",
         "gapcert.certification.ledger": "Entry Ledger",
+        "gapcert.certification.gates.entry": "responses",
         "gapcert.certification.refutation": "Trails follow",
         "gapcert.certification.routes": "Findings Request Route",
         "gapcert.certification.samples.executors": "processes",
@@ -33,7 +37,7 @@ _HOME = homes(
         "gapcert.contracts.data.units": "magnitude pretty shown stated_units without_units",
         "gapcert.contracts.gaps.claim": "Claim beta_of",
         "gapcert.contracts.gaps.gap": "FitRoute GapFamily GapFunction GapProblem",
-        "gapcert.contracts.gaps.lipschitz": "LipschitzBound LipschitzEstimator LipschitzProblem Provenance Residual",
+        "gapcert.contracts.gaps.lipschitz": ("LipschitzBound LipschitzEstimator LipschitzProblem Provenance Residual Symmetry"),
         "gapcert.contracts.gaps.predictor": "AffinePredictor ModelPredictor Predictor Samples",
         "gapcert.contracts.plugins.events": "BEAT Emit Event Pulse Stages silent",
         "gapcert.contracts.plugins.options": "ConfigContract Keyed of_config",
@@ -71,9 +75,10 @@ _HOME = homes(
         "gapcert.run.progress_rate": "duration figure",
         "gapcert.run.run": "Outcome Study cpu_seconds",
         "gapcert.run.status": "RunFolder folders walk",
-        "gapcert.run.verdict": "outside share",
+        "gapcert.run.verdict": "beside_nominal nothing_won outside share",
         "gapcert.spec.check": "COMPONENTS",
         "gapcert.spec.compose": "regular",
+        "gapcert.spec.expect": "evaluate_expectations",
         "gapcert.spec.models": "near unknown_key validate",
         "gapcert.spec.relations": "backend_axes",
         "gapcert.spec.sections": "sections",

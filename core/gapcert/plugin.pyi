@@ -8,10 +8,12 @@ from gapcert.certification.certificate import Statement as Statement
 from gapcert.certification.certificate import domain_data as domain_data
 from gapcert.certification.certificate import figures as figures
 from gapcert.certification.certificate import gap_digest as gap_digest
+from gapcert.certification.certificate import overpowered as overpowered
 from gapcert.certification.certificate import saved_digest as saved_digest
 from gapcert.certification.certify import predictor_of as predictor_of
 from gapcert.certification.compatibility import unmatched as unmatched
 from gapcert.certification.compatibility import unpaired as unpaired
+from gapcert.certification.contradiction import symmetric as symmetric
 from gapcert.certification.coordinates import Coordinates as Coordinates
 from gapcert.certification.coordinates import RelativeModel as RelativeModel
 from gapcert.certification.coordinates import in_words as in_words
@@ -20,9 +22,12 @@ from gapcert.certification.fingerprint import Fingerprint as Fingerprint
 from gapcert.certification.fingerprint import digest as digest
 from gapcert.certification.gates.augment import forgets as forgets
 from gapcert.certification.gates.augment import widen as widen
+from gapcert.certification.gates.circle import repeating as repeating
+from gapcert.certification.gates.entry import responses as responses
 from gapcert.certification.gates.hidden_distribution import Law as Law
 from gapcert.certification.gates.hidden_distribution import beginning as beginning
 from gapcert.certification.gates.hidden_state import Gate as Gate
+from gapcert.certification.gates.hidden_state import open_gate as open_gate
 from gapcert.certification.ledger import Entry as Entry
 from gapcert.certification.ledger import Ledger as Ledger
 from gapcert.certification.refutation import Trails as Trails
@@ -72,6 +77,7 @@ from gapcert.contracts.gaps.lipschitz import LipschitzEstimator as LipschitzEsti
 from gapcert.contracts.gaps.lipschitz import LipschitzProblem as LipschitzProblem
 from gapcert.contracts.gaps.lipschitz import Provenance as Provenance
 from gapcert.contracts.gaps.lipschitz import Residual as Residual
+from gapcert.contracts.gaps.lipschitz import Symmetry as Symmetry
 from gapcert.contracts.gaps.predictor import AffinePredictor as AffinePredictor
 from gapcert.contracts.gaps.predictor import ModelPredictor as ModelPredictor
 from gapcert.contracts.gaps.predictor import Predictor as Predictor
@@ -198,10 +204,13 @@ from gapcert.run.run import cpu_seconds as cpu_seconds
 from gapcert.run.status import RunFolder as RunFolder
 from gapcert.run.status import folders as folders
 from gapcert.run.status import walk as walk
+from gapcert.run.verdict import beside_nominal as beside_nominal
+from gapcert.run.verdict import nothing_won as nothing_won
 from gapcert.run.verdict import outside as outside
 from gapcert.run.verdict import share as share
 from gapcert.spec.check import COMPONENTS as COMPONENTS
 from gapcert.spec.compose import regular as regular
+from gapcert.spec.expect import evaluate_expectations as evaluate_expectations
 from gapcert.spec.models import near as near
 from gapcert.spec.models import unknown_key as unknown_key
 from gapcert.spec.models import validate as validate

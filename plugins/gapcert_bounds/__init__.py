@@ -6,7 +6,10 @@ import sys
 
 from gapcert.plugin import LazyPackage, homes
 
-_HOME = homes({"gapcert_bounds.families.multilinear": "MultilinearPredictor"})
+_HOME = homes({
+    "gapcert_bounds.families.multilinear": "MultilinearPredictor",
+    "gapcert_bounds.families.stored": "calibrated stored",
+})  # fmt: skip
 
 __all__ = sorted(_HOME)
 sys.modules[__name__].__class__ = LazyPackage

@@ -67,7 +67,7 @@ class Windows:
     rows: int
     skipped: int
     outside: int
-    copies: tuple[str, ...] = ()
+    copies: Copies
 
     def __len__(self) -> int:
         """How many windows there are."""
@@ -123,7 +123,7 @@ class Windows:
         r = known.residual(steps.x[keep], steps.u[keep], steps.x_next[keep])
         left = int((~keep).sum())
         index = np.asarray(which, dtype=np.intp).reshape(-1)
-        return cls(steps.t[keep], z[keep], r, index, len(steps) + steps.skipped, steps.skipped, left, copies.told)
+        return cls(steps.t[keep], z[keep], r, index, len(steps) + steps.skipped, steps.skipped, left, copies)
 
 
 @final
@@ -132,8 +132,8 @@ class CalibratedRecording(SavedStatement):
     """A band that holds for all transitions of a further window, with probability 1 − ε on average over calibrations.
 
     `units` windows met Z; those of `fit` gave the band, those of `held` its widening: score · scale, (nx,), with the score of
-    `rank` among their `scores`. `states` are figures over the transitions of the held windows. entry: which calibration on
-    these measurements it is, where a book counts them.
+    `rank` among their `scores`. `states` are figures over the transitions of the held windows. window: the length of one in s,
+    None for whole trajectories. entry: which calibration on these measurements it is, where a book counts them.
     """
 
     gap: CalibratedGap
@@ -180,7 +180,7 @@ class CalibratedRecording(SavedStatement):
     @property
     def warnings(self) -> list[str]:
         """What a reader of the claim should know first."""
-        rows, said = self.held.unused, [f"counted once: {copy}" for copy in self.held.copies]
+        rows, said = self.held.unused, [self.held.copies.told] if self.held.copies.found else []
         if 2 * rows["no_transition"] > rows["all"]:
             said.append(
                 f"{rows['no_transition']:,} of {rows['all']:,} rows begin no transition of one period of "
@@ -201,9 +201,12 @@ class CalibratedRecording(SavedStatement):
     def summary(self) -> dict[str, Any]:
         measured = {
             "units": self.units,
+            "window": self.window,
             "windows": {"fit": len(self.fit), "calibration": len(self.held)},
             "transitions": {"fit": len(self.fit.z), "calibration": len(self.held.z)},
             "rows": self.held.unused,
+            "trajectories": len(self.held.copies.rows),
+            "copies": self.held.copies.summary(),
             "rank": self.rank,
             "score": self.score,
             "widening": self.gap.widening.tolist(),
@@ -313,7 +316,7 @@ def _dealt(found: Windows, fit: float, violation: float, beta: float | None, win
         f"{CALLER}: {units} {what} have transitions in the domain, {fitted} of them for the fit; {asked} needs {need} others, "
         f"{total} in all, and {left} allow {order_statistics.smallest(left, beta):g} at best; record more, take shorter "
         f"windows if these are {'exchangeable' if beta is None else 'independent'} too, or ask for a larger violation"
-        + (f" (what is in the recording twice counts once: {'; '.join(found.copies)})" if found.copies else "")
+        + (f" ({found.copies.told})" if found.copies.found else "")
     )
 
 
@@ -366,7 +369,7 @@ def _sentences(
         else f"unless this calibration is one of a share β = {beta:g} that are worse."
     )
     rows = found.unused
-    once = f"What is in the recording twice counts once: {'; '.join(found.copies)}. Windows with such rows are left out."
+    once = f"{found.copies.told}; windows with such rows are left out."
     return (
         f"The unit is {unit}: {len(found)} have transitions in the domain, and these units, with the one that the claim is "
         f"about, are {like}. That is assumed, not tested; a machine that wears, warms up or decays breaks it.",
@@ -377,5 +380,5 @@ def _sentences(
         f"a transition begins in Z: {in_words(model, domain)}. Of {rows['all']:,} rows {rows['no_transition']:,} begin no such "
         f"transition and {rows['outside']:,} one outside Z or in no whole window; nothing is said of them.",
         "It does not carry over to other inputs, machines or days, nor to a closed loop that chooses its own points.",
-        *((once,) if found.copies else ()),
+        *((once,) if found.copies.found else ()),
     )

@@ -43,6 +43,7 @@ from gapcert.plugin import (
     in_words,
     order_statistics,
 )
+from gapcert_bounds import calibrated
 from gapcert_functions import DominatingGap
 
 from .stochastic_backend import NoiseDraws, again, drawn
@@ -57,11 +58,7 @@ class CalibratedGap(GapFunction):
         self.predictor = inner.predictor
 
     def interval(self, z: Array) -> tuple[Array, Array]:
-        low, high = ends(self.inner, z)
-        middle = low + (high - low) / 2
-        # A residual whose score is within the threshold lies in [l − w, u + w], which then is not empty; elsewhere any will do.
-        lower, upper = np.nextafter(low - self.widening, -np.inf), np.nextafter(high + self.widening, np.inf)
-        return np.minimum(lower, middle) - self.resolution, np.maximum(upper, middle) + self.resolution
+        return calibrated(*ends(self.inner, z), self.widening, self.resolution)
 
     def interval_over(self, boxes: Interval) -> Interval:
         if self.form["form"] == "constant":

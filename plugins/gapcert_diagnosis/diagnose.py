@@ -60,18 +60,21 @@ def diagnose(
     _timed(model, recording, horizons)
     parts, copies = _once(recording, hold_out or {"last": 0.25}, train, [s.name for s in model.inputs])
     more = experiment or {}
-    if copies:
-        clock.emit(Event("warning", "recording", {"message": copies}))
+    if copies.found:
+        clock.emit(Event("warning", "recording", {"message": copies.told}))
     problem = DiagnosisProblem(model, recording, *parts, _effects(effects), horizons, window, more, seed, folder, clock)
     others = (c.load()() for c in registry().of("diagnoser") if c.missing() is None)
     answer = next((d.diagnose for d in others if d.accepts(model)), _searched)
     found = answer(problem)
-    return replace(found, timings=clock.laps, assumptions=(*found.assumptions, *((copies,) if copies else ())))
+    if not copies.found:
+        return replace(found, timings=clock.laps)
+    log = {**found.log, "copies": copies.summary()}
+    return replace(found, timings=clock.laps, assumptions=(*found.assumptions, copies.told), log=log)
 
 
 def _once(
     recording: Recording, hold_out: Mapping[str, Any], train: Mapping[str, Any] | None, inputs: Sequence[str]
-) -> tuple[tuple[Recording, Recording], str]:
+) -> tuple[tuple[Recording, Recording], Copies]:
     """(what is fitted, what is held out), where what was measured once counts once; and what is in the recording twice.
 
     Where whole trajectories are held out, it is those that count, and their copies are not fitted.
@@ -86,12 +89,12 @@ def _once(
         left = [[tr for tr in part if tr is not None] for part in (kept[first:], kept[:first])]
         if not left[0]:
             raise UsageError(
-                f"hold_out: what is left for the fit is a copy of what is held out ({'; '.join(copies.told)}); expected other "
+                f"hold_out: what is left for the fit is a copy of what is held out ({copies.told}); expected other "
                 "measurements; hold out other trajectories",
                 ("diagnose", "hold_out"),
             )
         fitted, held = (replace(p, trajectories=tuple(trs)) for p, trs in zip((fitted, held), left, strict=True))
-    return (fitted, held), f"what is in the recording twice counts once: {'; '.join(copies.told)}" if copies.found else ""
+    return (fitted, held), copies
 
 
 @final

@@ -30,9 +30,10 @@ from gapcert.plugin import (
     stated_units,
     without_units,
 )
+from gapcert_bounds import calibrated, stored
 from gapcert_monitor.thresholds import THRESHOLDS
 from gapcert_recordings import Copies, Transitions, axes
-from gapcert_verify import Evidence, bounds, load, zone
+from gapcert_verify import Evidence, bounds, load, verify_run
 
 from .drift import drift as _drift
 
@@ -93,7 +94,8 @@ class Certified(Statement):
     def load(cls, folder: Path | str, allow_code: bool = False) -> Certified:
         """From a run's folder: its spec makes the model, its stored certificate the band; the backend is not needed.
 
-        Only where the certificate counts hidden states of the backend among its states is the backend built.
+        Only where the certificate counts hidden states of the backend among its states is the backend built. UsageError where
+        `gapcert verify` refuses the folder.
         """
         with damage_told(folder):
             return cls._loaded(Path(folder), allow_code)
@@ -103,6 +105,8 @@ class Certified(Statement):
         from gapcert.plugin import Build, ModelPredictor, load_spec, regular, widen
 
         evidence, data = load(where), _stored(where, "spec.json")
+        if failed := next((c for c in verify_run(where, allow_code=allow_code)["checks"] if not c["passed"]), None):
+            raise UsageError(f"{where}: is not what it claims ({failed['check']}: {failed['detail']}); run the spec again")
         home = Path(_stored(where, "run.json").get("folder", "."))
         # What is not asked for need not be there: neither engines nor their files.
         only = {k: data[k] for k in ("version", "name", "model")}
@@ -124,9 +128,12 @@ class Certified(Statement):
                 (extended, model) if relative is None else (RelativeModel(extended, relative), RelativeModel(model, relative))
             )
             p = ModelPredictor(*pair)
+        band, middle = _stored_band(evidence, p), np.add(evidence.zone.low, evidence.zone.high)[None] / 2
+        if (found := band(middle)[0].shape) != (1, model.nx):
+            raise ValueError(f"the band has the shape {found} at a point; expected one value for each of {model.nx} states")
         claim, window = Claim(**evidence.data["claim"]), (data.get("certificate") or {}).get("window")
         length = None if window is None else magnitude(window, "s")
-        return cls(model, zone(evidence.data), _stored_band(evidence, p), relative, claim, length)
+        return cls(model, evidence.zone, band, relative, claim, length)
 
     def points(self, x: Array, u: Array) -> Array:
         """z (n, nz) in the coordinates of Z; angles on the turn of Z."""
@@ -157,6 +164,14 @@ def _stored(folder: Path, name: str) -> dict[str, Any]:
 
 
 def _stored_band(evidence: Evidence, p: Predictor | None) -> Band:
+    """As the certificate computes it, where its gap function can be made again; else by intervals around it."""
+    own = {k.removeprefix("gap."): v for k, v in evidence.arrays.items() if k.startswith("gap.")}
+    made = stored(evidence.data["form"], own, evidence.zone, p)
+    if made is not None and "calibrated.widening" not in own:
+        return made.interval
+    if made is not None:
+        return lambda z: calibrated(*made.interval(z), own["calibrated.widening"], own["calibrated.resolution"])
+
     def band(z: Array) -> tuple[Array, Array]:
         e = evidence if p is None else replace(evidence, arrays={**evidence.arrays, "predictor.check": p(z)})
         low, high = bounds(e, z, "predictor.check")
@@ -174,8 +189,8 @@ class Check:
     `listed` largest excesses in the order of time; `violated` counts the transitions. rate = violated / points; rate_limit:
     its upper limit at 95 % (Clopper–Pearson), if transitions were independent. The verdict is `violated` where the claim is
     refuted: more of its `units` (transitions, or windows) have a violation than are `allowed`, see `tolerated`. drift: per
-    state, the change of r at a given z from the beginning to the end of the log, see `drift`. copies: trajectories, or rows,
-    that are in the log twice, and count once. `hint`: what to do next.
+    state, the change of r at a given z from the beginning to the end of the log, see `drift`. copies: what is in the log twice,
+    and counts once. `hint`: what to do next.
     """
 
     verdict: Literal["holds", "violated", "outside"]
@@ -188,15 +203,15 @@ class Check:
     rate: float | None
     rate_limit: float | None
     drift: Mapping[str, Mapping[str, Any] | None]
+    copies: Copies
     noise: Mapping[str, float] = field(default_factory=dict)
     hint: str = ""
     units: int = 0
     allowed: int = 0
-    copies: tuple[str, ...] = ()
 
     def summary(self) -> dict[str, Any]:
         """The JSON contract of `gapcert check`."""
-        lists = {"violations": list(self.violations), "copies": list(self.copies)}
+        lists = {"violations": list(self.violations), "copies": self.copies.summary()}
         return {**vars(self), **lists, "drift": dict(self.drift), "noise": dict(self.noise)}
 
 
@@ -245,10 +260,10 @@ def check(certified: Certified, recording: Recording, noise: Mapping[str, float]
         k / n if n else None,
         rate_limit(k, n) if n else None,
         drift,
+        copies,
         stated,
         units=units,
         allowed=most,
-        copies=copies.told,
     )
     return replace(made, hint=_hint(made, _noisy(steps, unknown, inside, model)))
 
@@ -367,7 +382,7 @@ def in_words(found: Check) -> list[str]:
     worst = sorted(found.violations, key=lambda v: -v["size"] / max(v["gamma"], 1e-300))[:5]
     lines += [f"  t = {v['t']:.6g} s: |r| of {v['state']} is {v['size']:.4g}, γ is {v['gamma']:.4g}" for v in worst]
     trends = {n: d for n, d in found.drift.items() if d is not None and d["trend"]}
-    lines += [f"  counted once: {copy}" for copy in found.copies]
+    lines += [f"  {found.copies.told}"] if found.copies.found else []
     lines += [f"  {n} drifts by {d['change']:.3g} (± {d['error']:.2g}) along the log" for n, d in trends.items()]
     return [*lines, *([found.hint] if found.hint else [])]
 

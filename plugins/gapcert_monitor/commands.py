@@ -23,7 +23,7 @@ def verify(options: Arguments) -> Answer:
     from gapcert_verify import verify_run
 
     with Terminal(sys.stderr, options.quiet) as terminal:
-        answer = verify_run(Path(options.run), terminal)
+        answer = verify_run(Path(options.run), terminal, allow_code=options.allow_code, again=options.again)
     rows = [("passed" if c["passed"] else "FAILED", c["check"], c["detail"]) for c in answer["checks"]]
     rows += [("trusted", sentence, "") for sentence in answer.get("trusted", ())]
     words = [f"{options.run}: {answer['verdict']}", *columns(("", "check", ""), rows)]

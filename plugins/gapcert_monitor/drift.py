@@ -12,13 +12,15 @@ from gapcert_monitor.thresholds import THRESHOLDS
 
 
 def drift(r: Array, gamma: Array, z: Array) -> dict[str, Any] | None:
-    """How much r (n,), without what is known of it, changes along the log: its slope over time beside a quadratic function of
-    z (n, nz). {"change", "error", "samples", "trend"}, or None with too few points.
+    """How much r (n,), without what is known of it, changes along the log: its slope over time beside a function of z (n, nz),
+    quadratic and of higher degree in each axis. {"change", "error", "samples", "trend"}; None with too few points, or where
+    time is nearly such a function: then what r is as a function of z, which need not be one, would look like a trend.
 
     A trend is sure where two errors of the slope agree on it, and told where it is at least `drift_share` of the median γ.
     One takes what is left for an AR(1) process, whose ρ is at the upper end of what is likely: n transitions tell as much as
     n (1 − ρ) / (1 + ρ) independent ones, `samples`. The other takes nothing for granted but that what is slow is about as
-    large at the `drift_waves` lowest frequencies as at that of a trend: of white noise it makes an exact t-test.
+    large at the `drift_waves` lowest frequencies as at that of a trend: of white noise it makes an exact t-test. Frequencies
+    of which z explains most tell nothing, and are not counted.
     """
     n = len(r)
     if n < THRESHOLDS.drift_points or not np.isfinite(r).all():
@@ -30,7 +32,8 @@ def drift(r: Array, gamma: Array, z: Array) -> dict[str, Any] | None:
     time = np.linspace(-0.5, 0.5, n)
     time, left = (v - known @ (known.T @ v) for v in (time, r))
     size = float(time @ time)
-    if size < n * THRESHOLDS.drift_apart:
+    # The mean square of time is 1/12; of what z leaves of it much is lost where the log goes through Z once.
+    if 12 * size < n * THRESHOLDS.drift_apart:
         return None
     change = float(time @ left) / size
     left = left - change * time
@@ -38,19 +41,22 @@ def drift(r: Array, gamma: Array, z: Array) -> dict[str, Any] | None:
     if (freedom := samples - k) < THRESHOLDS.drift_freedom:
         return {"change": change, "error": None, "samples": samples, "trend": False}
     # n − k of its n squares are left by k regressors where samples are independent; of fewer, k take a larger share.
-    errors = float(np.sqrt(left @ left / freedom / size)), _slow(left, known, time) / float(np.sqrt(size))
-    level = (1 + THRESHOLDS.drift_level) / 2
-    sure = all(abs(change) > e * student.ppf(level, f) for e, f in zip(errors, (freedom, THRESHOLDS.drift_waves), strict=True))
+    errors = [(float(np.sqrt(left @ left / freedom)), freedom), _slow(left, known, time)]
+    level, unit = (1 + THRESHOLDS.drift_level) / 2, abs(change) * float(np.sqrt(size))
+    sure = all(f >= 1 and unit > e * student.ppf(level, f) for e, f in errors)
     told = bool(sure and abs(change) > THRESHOLDS.drift_share * np.median(gamma))
-    return {"change": change, "error": max(errors), "samples": samples, "trend": told}
+    return {"change": change, "error": max(e for e, _ in errors) / float(np.sqrt(size)), "samples": samples, "trend": told}
 
 
 def _known(z: Array) -> Array:
-    """An orthonormal basis (n, k) of the quadratic functions of z at its points."""
-    spread = z.std(axis=0)
-    w = (z - z.mean(axis=0))[:, spread > 0] / spread[spread > 0]
+    """An orthonormal basis (n, k), at its points, of functions of z that are quadratic, and of `drift_degree` in each axis."""
+    middle, half = (z.max(axis=0) + z.min(axis=0)) / 2, np.ptp(z, axis=0) / 2
+    w = (z - middle)[:, half > 0] / half[half > 0]
     first, second = np.triu_indices(w.shape[1])
-    basis, size, _ = np.linalg.svd(np.hstack([np.ones((len(w), 1)), w, w[:, first] * w[:, second]]), full_matrices=False)
+    powers = [w**d for d in range(3, THRESHOLDS.drift_degree + 1)]
+    basis, size, _ = np.linalg.svd(
+        np.hstack([np.ones((len(w), 1)), w, w[:, first] * w[:, second], *powers]), full_matrices=False
+    )
     return np.asarray(basis[:, size > 1e-9 * size[0]])
 
 
@@ -65,9 +71,14 @@ def _independent(left: Array, k: int) -> float:
     return n * (1 - rho) / (1 + rho) if 0 < rho < 1 else n * float(rho <= 0)
 
 
-def _slow(left: Array, known: Array, time: Array) -> float:
-    """The standard deviation of what is left along each of the lowest cosines that the regressors leave."""
-    waves = np.cos(np.pi * np.outer(np.arange(len(left)) + 0.5, np.arange(1, THRESHOLDS.drift_waves + 1)) / len(left))
+def _slow(left: Array, known: Array, time: Array) -> tuple[float, int]:
+    """The standard deviation of what is left along each of the lowest cosines that the regressors leave, and how many these
+    are, whose share left is `drift_apart` or more.
+    """
+    n = len(left)
+    waves = np.cos(np.pi * np.outer(np.arange(n) + 0.5, np.arange(1, THRESHOLDS.drift_waves + 1)) / n) * np.sqrt(2 / n)
     regressors = np.column_stack([known, time / np.linalg.norm(time)])
-    basis = np.linalg.qr(waves - regressors @ (regressors.T @ waves))[0]
-    return float(np.sqrt(np.mean((basis.T @ left) ** 2)))
+    basis, size, _ = np.linalg.svd(waves - regressors @ (regressors.T @ waves), full_matrices=False)
+    basis = basis[:, size**2 >= THRESHOLDS.drift_apart]
+    count = basis.shape[1]
+    return (float(np.sqrt(np.mean((basis.T @ left) ** 2))) if count else 0.0), count

@@ -8,6 +8,9 @@ _NOISE = Argument(
     {"action": "append", "default": [], "metavar": "CHANNEL=VALUE"},
 )
 _QUIET = Argument("--quiet -q", "no progress", {"action": "store_true"})
+_AGAIN = Argument(
+    "--again", "step so many stored transitions of engine and model once more", {"type": int, "default": 0, "metavar": "N"}
+)
 
 
 @hookimpl
@@ -26,6 +29,6 @@ def gapcert_components() -> list[Component]:
             "verify",
             "prove a certificate and its controller again from their stored data",
             "gapcert_monitor.commands:verify",
-            arguments=(RUN, _QUIET),
+            arguments=(RUN, _AGAIN, ALLOW_CODE, _QUIET),
         ),
     ]

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import final
 
 import numpy as np
 
-from gapcert.plugin import Array, Box, Domain, Pulse, SynthesisProblem
+from gapcert.plugin import Array, Box, Domain, Pulse, SynthesisProblem, UsageError
 from gapcert_cells import FAR, ranges, sufficient
 from gapcert_mpc.thresholds import THRESHOLDS
 
@@ -116,7 +117,9 @@ class Task:
         problem, domain = replace(self.problem, gap=None), self.problem.domain
 
         def held(inputs: Box) -> bool:
-            return enough(replace(self, problem=replace(problem, domain=replace(domain, inputs=inputs))))
+            with suppress(UsageError):  # about wider inputs a line may be one that no gain stabilises
+                return enough(replace(self, problem=replace(problem, domain=replace(domain, inputs=inputs))))
+            return False
 
         if held(domain.inputs):
             return self.nothing(reason)

@@ -10,7 +10,7 @@ import itertools
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import final
+from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
@@ -82,11 +82,24 @@ class Copies:
         return replace(recording, trajectories=tuple(tr for tr in kept if tr is not None)) if self.found else recording
 
     @property
-    def told(self) -> tuple[str, ...]:
-        """A sentence for each, and one for those beyond the `copies_told` first."""
-        most = THRESHOLDS.copies_told
-        more = (f"and {len(self.found) - most} more",) if len(self.found) > most else ()
-        return tuple(map(str, self.found[:most])) + more
+    def told(self) -> str:
+        """How many of the trajectories, and the `copies_told` first by name, those that are copies as a whole before others, in
+        one sentence without its end; empty where nothing was found.
+        """
+        if not self.found:
+            return ""
+        whole, parts = ([c for c in self.found if c.whole is k] for k in (True, False))
+        named = [*map(str, whole[:1]), *(f"'{c.name}' of '{c.of}'" for c in whole[1:]), *map(str, parts)]
+        named, more = named[: THRESHOLDS.copies_told], len(named) - THRESHOLDS.copies_told
+        count = len({c.name for c in self.found})
+        one, many = ("has rows that are", "have rows that are") if parts else ("is", "are")
+        are = f"{one} a copy and counts" if count == 1 else f"{many} copies of others and count"
+        rest = [f"and {more} more"] if more > 0 else []
+        return f"{count} of {len(self.rows)} trajectories {are} once: {', '.join([*named, *rest])}"
+
+    def summary(self) -> list[dict[str, Any]]:
+        """As plain data: name, of, start, rows and whole of each."""
+        return [vars(c).copy() for c in self.found]
 
 
 def _titles(trajectories: Sequence[Trajectory]) -> list[str]:
@@ -153,12 +166,21 @@ class _Series:
 
 
 def _step(v: Array) -> float:
-    """The step of a lattice on which values (n,) lie, as counts do; 0 where they lie on none."""
-    unique = np.unique(v)
-    apart = np.diff(unique)
-    apart = apart[apart > 1e-9 * np.ptp(unique)] if len(apart) else apart
-    counts = apart / apart.min(initial=np.inf)
-    return float(apart.min()) if len(apart) and (np.abs(counts - np.round(counts)) < 1e-3).all() else 0.0
+    """The step of a lattice on which values (n,) lie, as counts do, by Euclid's algorithm; 0 where they lie on none."""
+    gaps = np.diff(np.unique(v))
+    gaps = gaps[gaps > 1e-9 * gaps.sum()]
+    left = gaps
+    while len(left) and (step := float(left.min())) > 1e-9 * gaps.sum():
+        # What is written with few digits knows a step from many of them.
+        for most in (1, 5, 50, np.inf):
+            counts = np.round(gaps / step)
+            few = (counts > 0) & (counts <= most) & (np.abs(gaps - step * counts) < 0.05 * step)
+            step = float(gaps[few] @ counts[few] / (counts[few] @ counts[few])) if few.any() else step
+        left = np.abs(gaps - step * np.round(gaps / step))
+        left = left[left > 1e-3 * step]
+        if not len(left):
+            return step
+    return 0.0
 
 
 def _form(v: Array) -> tuple[int, int, bool]:

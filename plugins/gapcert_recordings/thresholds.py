@@ -42,7 +42,7 @@ class Thresholds:
     copy_ratio: int = chosen(50, "of periods, at most, at which one is taken for a thinned copy of another")
     copy_channels: int = chosen(6, "that are looked up: what tells no two apart costs time")
     copy_apart: int = chosen(16, "rows of one log, nearer to each other than that, are neighbours")
-    copies_told: int = chosen(10, "by name: a recording may hold many")
+    copies_told: int = chosen(3, "by name: a recording may hold many, and a program reads all of them")
     form_values: int = chosen(400, "of a channel tell with how many digits it is written")
     hole_step: float = chosen(1.5, "of the period: longer steps of time are holes")
     hole_ends: int = chosen(5, "samples on either side of a hole that tell how fast it turns there")

@@ -21,11 +21,12 @@ from gapcert_figures import (
 )
 
 from .words.summary import markdown
+from .words.words import refutation
 
 
 @final
 class Illustrator:
-    """An Emit that adds `figure`, `markdown` (what was found, as text), `number` and `lanes` to events.
+    """An Emit that adds `figure`, `markdown` (what was found, as text), `refuted` (was it?), `number` and `lanes` to events.
 
     Every event is passed on; all figures end up in the run folder. A picture may not cost a certificate: one that cannot be
     drawn becomes a warning.
@@ -50,7 +51,8 @@ class Illustrator:
             if figure is not None:
                 data["figure"] = figure
             if event.stage == "certificate":
-                data["markdown"] = markdown({"certificate": data["certificate"].summary()})
+                found = data["certificate"].summary()
+                data |= {"markdown": markdown({"certificate": found}), "refuted": refutation(found) is not None}
         if event.name == "run-finished":
             data["figures"] = self.figures
             data["markdown"] = markdown(data["summary"])

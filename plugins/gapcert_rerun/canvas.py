@@ -107,10 +107,10 @@ class Plane:
         return rr.LineStrips3D(strips, colors=[colour] * len(strips), radii=width)
 
     def ribbon(self, x: Array, low: Array, high: Array, colour: Colour, height: float = 0.01) -> rr.Mesh3D:
-        """What lies between low and high (T,) over x (T,), cut off at the edges of the square."""
+        """What lies between low and high (T,) over x (T,), cut off at the edges of the square; nothing where low is above."""
         ends = (np.clip(e, self.y.low, self.y.high) for e in (low, high))
         edge = np.stack([self.at(np.column_stack([x, e]), height) for e in ends], axis=1).reshape(-1, 3)
-        first = 2 * np.arange(len(x) - 1)[:, None]
+        first = 2 * np.flatnonzero((low <= high)[1:] & (low <= high)[:-1])[:, None]
         faces = np.concatenate([first + np.array([0, 2, 1]), first + np.array([1, 2, 3])])
         return rr.Mesh3D(vertex_positions=edge, triangle_indices=faces, albedo_factor=colour)
 
@@ -161,10 +161,12 @@ TIME = "time"
 
 @final
 class Canvas:
-    """One recording; views: what is shown, by group and then by name; plays: is there a robot that moves?"""
+    """One recording; views: what is shown, by group and then by name; plays: is there a robot that moves? refuted: is what is
+    drawn a band that was refuted?
+    """
 
     def __init__(self, recording: rr.RecordingStream) -> None:
-        self.recording, self.plays = recording, False
+        self.recording, self.plays, self.refuted = recording, False, False
         self.views: dict[str, dict[str, rrb.View | Seen]] = {}
 
     def show(self, group: str, name: str, one: rrb.View | Seen) -> None:

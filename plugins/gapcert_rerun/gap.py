@@ -8,7 +8,7 @@ import rerun as rr
 from gapcert import Array
 from gapcert_figures import Axis, Band, CompareFigure, GapFigure, RecordedFigure, held, labelled
 
-from .canvas import FAINT, GOOD, STEP, TRUTH, WITH, WITHOUT, Canvas, Colour, Plane, Seen, series
+from .canvas import BAD, FAINT, GOOD, STEP, TRUTH, WITH, WITHOUT, Canvas, Colour, Plane, Seen, series
 
 _TUBE: Colour = (70, 108, 165, 255)
 _REACH: Colour = (36, 54, 82, 255)
@@ -16,13 +16,14 @@ _REACH: Colour = (36, 54, 82, 255)
 
 def draw_gap(canvas: Canvas, gap: GapFigure) -> None:
     """Per state: true gap beside γ as maps, and the residual in its band along the axis that leads."""
+    called = "refuted" if canvas.refuted else "certified"
     for s in gap.slices:
         root, top = f"gap/{s.state}", float(np.nanmax([s.gamma, s.gap]))
         left, right = Plane(gap.axes[0], gap.axes[1]), Plane(gap.axes[0], gap.axes[1], STEP)
         canvas.static(f"{root}/true", left.heat(s.gap, top))
         canvas.static(f"{root}/true/frame", *left.frame("true gap |f̂ − f|"))
         canvas.static(f"{root}/gamma", right.heat(s.gamma, top))
-        canvas.static(f"{root}/gamma/frame", *right.frame("certified γ, and samples", left=False))
+        canvas.static(f"{root}/gamma/frame", *right.frame(f"{called} γ, and samples", left=False))
         canvas.static(f"{root}/scale", *right.scale(top, s.unit))
         canvas.static(f"{root}/gamma/samples", rr.Points3D(right.at(gap.samples), radii=0.005, colors=[(255, 255, 255, 255)]))
         canvas.show("gap", s.state, Seen(root, f"How wrong: {s.state} [{s.unit}]{held(gap.fixed)}", 2, bar=True))
@@ -31,14 +32,21 @@ def draw_gap(canvas: Canvas, gap: GapFigure) -> None:
             if b.state == state:
                 _band(canvas, f"band/{state}/{b.axis.name}", b)
         axis = gap.bands[lead].axis.name
-        canvas.show("band", state, Seen(f"band/{state}/{axis}", f"f̂ − f of {state} along {axis}, and its band"))
+        canvas.show("band", state, Seen(f"band/{state}/{axis}", f"f̂ − f of {state} along {axis}, and its {called} band"))
 
 
 def _band(canvas: Canvas, path: str, b: Band) -> None:
     reach = 1.15 * max(b.constant, float(b.gamma.max()))
-    plane = canvas.plane(path, b.axis, Axis(f"gap of {b.state}", b.unit, -reach, reach))
-    canvas.static(f"{path}/gamma", plane.ribbon(b.at, -b.gamma, b.gamma, _REACH, 0.005))
-    canvas.static(f"{path}/envelope", plane.ribbon(b.at, b.low, b.high, _TUBE))
+    marks = [name for name, known in (("refuted", canvas.refuted), ("no band: l above u", b.empty.any())) if known]
+    plane = canvas.plane(path, b.axis, Axis(f"gap of {b.state}", b.unit, -reach, reach), "; ".join(marks))
+    drawn = (("gamma", -b.gamma, b.gamma, _REACH, 0.005), ("envelope", b.low, b.high, _TUBE, 0.01))
+    for name, low, high, colour, height in drawn:
+        # A refuted band has its ends alone, and so has one that no value lies in.
+        bare = np.full(len(b.at), canvas.refuted) | (low > high)
+        for side, end in (("low", low), ("high", high)) if bare.any() else ():
+            canvas.static(f"{path}/{name}_{side}", plane.curve(b.at, np.where(bare, end, np.nan), BAD))
+        if not bare.all():
+            canvas.static(f"{path}/{name}", plane.ribbon(b.at, low, high, colour, height))
     for side, sign in (("low", -1), ("high", 1)):
         level = np.full_like(b.at, sign * b.constant)
         canvas.static(f"{path}/constant_{side}", plane.curve(b.at, level, FAINT, 0.0015))

@@ -22,7 +22,8 @@ _ROWS = (
 _OVER_TIME = ("loop", "stretch", "channel", "error", "tube", "learned", "alive", "drift", "experiment", "robot")
 _WORDS = {
     "gap": "**Maps**: true gap beside γ on the same colours (black: outside the domain); dots: sampled points.",
-    "band": "**Bands**: white is f̂ − f, blue its certified [l, u], dark blue ±γ, grey lines the best constant bound.",
+    "band": "**Bands**: white is f̂ − f, blue its certified [l, u], dark blue ±γ, grey lines the best constant bound. "
+    "Red ends without a filling are those of a band that was refuted, or has no value in it.",
     "scores": "**Scores**: one dot per held window, in scales of the fit; the green one set the band.",
     "stretch": "**Gap as measured**: the window whose score set the band, and the band.",
     "winning": "**May start**: dark blue both controllers, orange only the one without γ, green only the one with γ; "

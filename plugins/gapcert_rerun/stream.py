@@ -85,6 +85,7 @@ class Stream:
             self.recording.log("log", rr.TextLog(str(event.data.get("message", "")), level=rr.TextLogLevel.WARN))
             self.recording.reset_time()
         if (draw := DRAWN.get(type(figure := event.data.get("figure")))) is not None:
+            self.canvas.refuted = event.data.get("refuted", False)
             draw(self.canvas, figure)
         if "markdown" in event.data:
             # What the pictures mean follows the answer: a panel shows as much of it as there is room for.
@@ -113,7 +114,8 @@ class Stream:
             lost = True
         finally:
             self.recording.disconnect()
-            lost = lost or not late.is_alive()
+            # One that is gone has not always been missed by the stream yet.
+            lost = lost or not late.is_alive() or (viewer is not None and viewer.process.poll() is not None)
             late.cancel()
             if self._over and self._aside and self._file:
                 self._aside.replace(self._file)

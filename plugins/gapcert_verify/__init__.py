@@ -8,7 +8,7 @@ from gapcert.plugin import LazyPackage, homes
 
 _HOME = homes(
     {
-        "gapcert_verify.evidence": "Evidence bounds load zone",
+        "gapcert_verify.evidence": "Evidence bounds load",
         "gapcert_verify.verify": "verify_run",
     }
 )

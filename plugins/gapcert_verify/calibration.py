@@ -47,16 +47,27 @@ def miscounted(e: Evidence) -> str:
     if "book" not in audit:
         return ""
     key = e.stored(f"audit-{audit['number']}")[0]["key"]
-    of = hashlib.sha256(json.dumps([e.data["family"], e.data["form"], e.data["seed"]], sort_keys=True).encode())
-    for name, array in sorted(e.arrays.items()):
-        if name.startswith("gap.") and (made is None or not name.startswith("gap.calibrated.")):
-            of.update(name[4:].encode() + np.ascontiguousarray(array).tobytes())
-    text = f"{of.hexdigest()}:{key}:{audit['epsilon']!r}:{audit['beta']!r}"
+    text = f"{_function(e, calibrated=made is None)}:{key}:{audit['epsilon']!r}:{audit['beta']!r}"
     if made is not None:
         text = f"calibrate:{text}:{made['exceedances']}:{made['repeats']}"
-    kind = "audit" if made is None else "calibration"
-    own = {"number": audit["number"], "kind": kind, "audited": hashlib.sha256(text.encode()).hexdigest()}
-    same = all(audit["book"][k] == v for k, v in own.items()) and audit["book"]["question"]
+    return _entered(audit, "audit" if made is None else "calibration", text)
+
+
+def _function(e: Evidence, calibrated: bool) -> str:
+    """Identity of the stored function, before or after it was calibrated."""
+    of = hashlib.sha256(json.dumps([e.data["family"], e.data["form"], e.data["seed"]], sort_keys=True).encode())
+    for name, array in sorted(e.arrays.items()):
+        if name.startswith("gap.") and (calibrated or not name.startswith("gap.calibrated.")):
+            of.update(name[4:].encode() + np.ascontiguousarray(array).tobytes())
+    return of.hexdigest()
+
+
+def _entered(stated: Mapping[str, Any], kind: str, text: str) -> str:
+    """ "" where the book's entry is of this text, or there is none."""
+    if (book := stated.get("book")) is None:
+        return ""
+    own = {"number": stated["number"], "kind": kind, "audited": hashlib.sha256(text.encode()).hexdigest()}
+    same = all(book[k] == v for k, v in own.items()) and book["question"]
     return "" if same else "the entry in the book is not of what was audited"
 
 
@@ -120,10 +131,10 @@ def _scale(e: Evidence) -> str:
 def _rank(e: Evidence, z: Array, residuals: list[Array]) -> str:
     """The score is the (N − m)-th smallest."""
     made = e.data["calibration"]
-    return _ranked(e, made, _scores(e, z, residuals), len(z) - made["exceedances"])
+    return _ranked(e, made, scores(e, z, residuals), len(z) - made["exceedances"])
 
 
-def _scores(e: Evidence, z: Array, residuals: list[Array]) -> Array:
+def scores(e: Evidence, z: Array, residuals: list[Array]) -> Array:
     """(2, n): no more and no less than the score of each point, the largest of its draws."""
     scale = e.arrays["calibration.scale"]
     low, high = uncalibrated(e, z, "predictor.calibration")
@@ -172,8 +183,9 @@ def windows(e: Evidence) -> str:
         return text
     if text := _scale(e):
         return text
-    ends = np.stack([order_statistics.worst(own, arrays["held.window"]) for own in _scores(e, z, [arrays["held.r"]])])
-    return _ranked(e, made, ends, made["rank"])
+    ends = np.stack([order_statistics.worst(own, arrays["held.window"]) for own in scores(e, z, [arrays["held.r"]])])
+    text = f"recording:{_function(e, calibrated=True)}:{e.data['claim']['epsilon']!r}:{e.data['claim'].get('beta')!r}"
+    return _ranked(e, made, ends, made["rank"]) or _entered(made, "calibration", text)
 
 
 def _enough(claim: Mapping[str, Any], n: int, rank: int) -> str:

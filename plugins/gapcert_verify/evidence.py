@@ -37,6 +37,12 @@ class Evidence:
         numbers = sorted(line["chunk"] for line in lines)
         return header, np.concatenate([np.load(folder / f"chunk-{i:06d}.npy") for i in numbers])
 
+    def header(self, name: str) -> dict[str, Any]:
+        """The first line of a round's manifest."""
+        with open(self.folder / "samples" / name / "manifest.jsonl", encoding="utf-8") as lines:
+            found: dict[str, Any] = json.loads(lines.readline())
+        return found
+
     def round(self, name: str) -> tuple[Array, Array]:
         """(z, r) of a round; grid points are recomputed from the cover."""
         header, r = self.stored(name)
@@ -46,6 +52,11 @@ class Evidence:
         z = np.load(path)[r["index"]] if path.exists() else grid_at(self.zone, tuple(self.data["cover"]), r["index"])
         rows = extremes(self.data, header["extremes"], z, r)
         return z[rows], np.ascontiguousarray(r["r"][rows])
+
+    @property
+    def older(self) -> bool:
+        """Was it written before format 2, so that it holds less than its sentences say?"""
+        return "format" not in self.data
 
     @cached_property
     def taken(self) -> int:
@@ -57,11 +68,8 @@ class Evidence:
     def reduced(self) -> bool:
         """Were only the extremes of coarse cells kept? As the manifests say, where they can be read."""
         for name in self.data["digests"]:
-            with (
-                suppress(OSError, ValueError),
-                open(self.folder / "samples" / name / "manifest.jsonl", encoding="utf-8") as lines,
-            ):
-                if "extremes" in json.loads(lines.readline()):
+            with suppress(OSError, ValueError):
+                if "extremes" in self.header(name):
                     return True
         return False
 

@@ -51,6 +51,22 @@ def margin(e: Evidence) -> str | None:
     return ""
 
 
+def radii(e: Evidence) -> tuple[float, float]:
+    """(εx, εu) of the stated grid, rounded up."""
+    h, nx = _half_widths(e.data), e.data["domain"]["states"]
+    return float(_norm(h[:nx]).hi), float(_norm(h[nx:]).hi)
+
+
+def reach(e: Evidence) -> Array:
+    """(nx,) L₂x εx + L₂u εu + 2 e, rounded up: what data alone leave between two points of the cover."""
+    h, nx, constants = _half_widths(e.data), e.data["domain"]["states"], e.arrays["lipschitz"]
+    h = [Interval.exact(0.0) if (constants[:, j] == 0).all() else h[j] for j in range(len(h))]
+    ex, eu = _norm(h[:nx]), _norm(h[nx:])
+    parts = [[_norm([Interval.exact(c) for c in row[part]]) for part in (slice(nx), slice(nx, None))] for row in constants]
+    both = [x * ex + u * eu + Interval.exact(d) * 2.0 for (x, u), d in zip(parts, e.arrays["resolution"], strict=True)]
+    return np.array([float(total.hi) for total in both])
+
+
 def _clearance(e: Evidence, i: int, z: Array, r: Array) -> float:
     """min_k γ_i(z_k) − |r_ki|, from below."""
     worst = math.inf

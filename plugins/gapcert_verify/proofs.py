@@ -99,7 +99,7 @@ def _beside(a: Array, dimensions: int) -> Interval:
     return (Interval.exact(a[1:]) - a[:-1]).reshape(-1, *(1,) * (dimensions - 1))
 
 
-def exceeds(e: Evidence, i: int, gamma: float) -> str:
+def exceeds(e: Evidence, i: int, gamma: float, budget: int = 400_000) -> str:
     """ "" where branch and bound proves that the envelope of state i stays within ±gamma on Z, else what stands against it.
 
     Over a box with centre c and half-widths h, u ≤ max p + min_k g_k + Σ_j L_j (|c_j − z_kj| + h_j) + J + 2 e, and l likewise.
@@ -107,12 +107,12 @@ def exceeds(e: Evidence, i: int, gamma: float) -> str:
     for part in e.parts:
         if len(part.z) == 0 and e.zone.outside(part.box)[0]:
             continue
-        if text := _exceeds(e, part, i, gamma) if len(part.z) else "a cell that may meet Z has no sample, and no bound":
+        if text := _exceeds(e, part, i, gamma, budget) if len(part.z) else "a cell that may meet Z has no sample, and no bound":
             return text
     return ""
 
 
-def _exceeds(e: Evidence, part: Part, i: int, gamma: float, budget: int = 400_000) -> str:
+def _exceeds(e: Evidence, part: Part, i: int, gamma: float, budget: int) -> str:
     constants, kind = part.constants[i], e.data["predictor"]
     weight = constants + (np.abs(e.arrays["predictor.slope"][i]) if kind == "affine" else 0.0)
     if kind == "multilinear":

@@ -11,19 +11,27 @@ import hashlib
 import json
 import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gapcert.plugin import DAMAGE, Array, Emit, Interval, UsageError, on_curvature, silent
+from gapcert.plugin import DAMAGE, Array, Emit, GapcertError, Interval, UsageError, on_curvature, silent
 
+from . import sentences
 from . import statements as stated
 from .calibration import calibrated, draws, further, miscounted, names, noise, windows
 from .controllers.saved import controlled
 from .evidence import Evidence, Part, another, bounds, distance, load, predictor
 from .margin import margin
 from .proofs import bent, dominates, exceeds, follows
+from .run_folder.origin import CHECKS as ORIGIN
+from .run_folder.origin import Check, Origin, arithmetic, gates, origin, shifted
+from .run_folder.origin import again as again_of
+from .run_folder.pictures import figures, page
+from .run_folder.summary import root, summary, whole_run
+from .yardsticks import spent, yardsticks
 
 ROUTES = {
     "envelope": ("dominate",),
@@ -34,15 +42,23 @@ ROUTES = {
     "network": ("theorem1",),
 }
 """Route calibrate certifies any of them."""
+FOLDER: tuple[tuple[str, Check], ...] = (
+    ("the summary says what follows", summary),
+    ("pictures show what is stored", figures),
+    ("the page is that of summary and figures", page),
+)
+LATER = (arithmetic, gates, shifted, figures, page)
+"""What a certificate of before format 2 has no data for, or said in other words: it is told as trusted there."""
 CLAIMS = ("deterministic", "statistical", "empirical", "assumed")
 PROVENANCES = ("analytic", "interval", "declared", "estimated")
 UNIFORM = "uniform on X × U"
 
 
-def verify_run(folder: Path | str, emit: Emit = silent) -> dict[str, Any]:
+def verify_run(folder: Path | str, emit: Emit = silent, *, allow_code: bool = False, again: int = 0) -> dict[str, Any]:
     """{"verdict": "holds" | "fails", "claim", "checks": [{"check", "passed", "detail"}], "trusted": [sentence]}.
 
-    UsageError where there is no certificate. emit: takes the progress of long proofs.
+    emit: takes the progress of long proofs. allow_code: models that are code are run. again: so many stored transitions are
+    stepped once more, by whatever backend the spec names. UsageError where there is no certificate.
     """
     evidence = load(Path(folder))
     checks: list[tuple[str, Callable[[Evidence], str | None]]] = [
@@ -51,6 +67,7 @@ def verify_run(folder: Path | str, emit: Emit = silent) -> dict[str, Any]:
         ("γ ≥ |r| on every sample of the bound", _samples),
         ("the stored function is the one that samples and constants give", _function),
         ("the margin covers the cover's radius", margin),
+        ("a cover is stated where the samples are one", _covered),
         ("the audit's points are those that its seed draws", _drawn),
         ("sampled and audited points lie in Z", _within),
         ("the declared symmetry holds on the pairs that were looked at", stated.symmetry),
@@ -60,6 +77,8 @@ def verify_run(folder: Path | str, emit: Emit = silent) -> dict[str, Any]:
         ("the audit has enough points for its ε and β", _enough),
         ("l ≤ r ≤ u at every audited point, as stated", _audit),
         ("figures of the states follow from the audit", stated.figures),
+        ("constant bounds and envelopes follow from samples and constants", yardsticks),
+        ("as many transitions were spent as are stored", spent),
         ("the claim is one that its evidence allows", _claim),
     ]
     if _bare(evidence):
@@ -69,8 +88,23 @@ def verify_run(folder: Path | str, emit: Emit = silent) -> dict[str, Any]:
             ("stored data match their digests", _packed),
             ("the held windows give the widening of the band", windows),
             ("figures of the states follow from the held windows", stated.held_figures),
+            ("constant bounds and envelopes follow from samples and constants", yardsticks),
             ("the claim is one that its evidence allows", further),
         ]
+    checks += [
+        ("constants come from what they are said to come from", _method),
+        ("assumptions are those that the data give", _since(sentences.assumptions)),
+        ("warnings are those that gates and estimators give", _since(sentences.warnings)),
+    ]
+    source = _whence(evidence, allow_code, bool(again))
+    checks += [
+        ("the folder of a run is whole", whole_run),
+        ("files match the root digest", root),
+        ("the spec is the one that was run", partial(_specified, source)),
+        *((name, partial(_asked, check, source)) for name, check in (*ORIGIN, *FOLDER)),
+    ]
+    if again and isinstance(source, Origin) and source.whole and "audit" in evidence.data:
+        checks.append(_stepped_again(evidence, source, again))
     controller = controlled(evidence, emit)
     checks += [] if controller is None else controller.checks
     results = []
@@ -81,12 +115,16 @@ def verify_run(folder: Path | str, emit: Emit = silent) -> dict[str, Any]:
     verdict = "holds" if all(r["passed"] for r in results) else "fails"
     try:
         claim = dict(evidence.data["claim"])
-        trusted = [*_trusted(evidence), *(() if controller is None else controller.trusted)]
+        trusted = [*_trusted(evidence, source), *(() if controller is None else controller.trusted)]
     except DAMAGE as error:
         raise UsageError(
             f"{folder}: certificate.json is damaged ({type(error).__name__}: {error}); run the spec again"
         ) from None
     return {"verdict": verdict, "claim": claim, "checks": results, "trusted": trusted}
+
+
+def _method(e: Evidence) -> str | None:
+    return None if _bare(e) else sentences.method(e)
 
 
 def _bare(e: Evidence) -> bool:
@@ -95,63 +133,102 @@ def _bare(e: Evidence) -> bool:
 
 
 def _stated(e: Evidence) -> str:
-    gamma, states = e.arrays["gap.gamma"], e.data["domain"]["axes"][: e.data["domain"]["states"]]
-    if e.data["claim"] != {"kind": "assumed"} or e.data["form"] != {"form": "constant"}:
-        return f"the claim is {e.data['claim']} of {e.data['form']}, and what is declared is an assumed constant"
-    if gamma.tolist() != [e.data["states"][n]["gamma_max"] for n in states]:
-        return f"γ is stored as {gamma.tolist()}, and stated otherwise"
+    gamma, names = e.arrays["gap.gamma"], sentences.states(e)
+    made = {"claim": {"kind": "assumed"}, "form": {"form": "constant"}, "vacuous": False}
+    made["states"] = {n: {"gamma_max": g} for n, g in zip(names, gamma.tolist(), strict=True)}
+    if other := next((k for k, v in made.items() if e.data.get(k) != v), ""):
+        return f"{other} is stated as {e.data.get(other)}, and of a declared γ it is {made[other]}"
     return "" if (np.isfinite(gamma) & (gamma >= 0)).all() else f"γ is {gamma.tolist()}, which bounds nothing"
 
 
-def _trusted(e: Evidence) -> list[str]:
+def _trusted(e: Evidence, source: Origin | str | UsageError) -> list[str]:
     """What the verdict rests on beside the checks."""
+    told: list[tuple[str, Any]] = [
+        (f"Model, domain, names and what was asked are as stated: {source}.", not isinstance(source, Origin)),
+        ("Versions, times, and budgets of the spec that only a new run could tell are as stated.", True),
+        ("It is of before format 2: its sentences, e, hidden state, answer, pictures and page are as stated.", e.older),
+    ]
+    whole = isinstance(source, Origin) and source.text
     if _bare(e):
-        return ["γ is what a person declares. No simulator was asked."]
+        return [text for text, so in ((_NOBODY, True), *told) if so]
     if "recording" in e.data:
         alike = "independent draws of one distribution" if "beta" in e.data["claim"] else "exchangeable"
-        return [
-            "The stored transitions are all of the recording's that begin in Z, and their residuals are those of f.",
-            f"The windows, and the one that the claim is about, are {alike}.",
-            "Model, domain, windows and family were chosen before anyone looked at the held windows.",
-            "Figures that need the model (overpowered, the constant bound, vacuous beside standing still) are as stated.",
+        told += [
+            (f"The stored transitions are {_RECORDED}.", True),
+            ("Which rows of the recording are copies of others is as stated.", sentences.copies(e)),
+            (f"The windows, and the one that the claim is about, are {alike}, chosen before anyone looked at these.", True),
         ]
-    origin = e.data["lipschitz"]
-    compared = "they were compared with samples, not derived again."
-    constants = f"The constants are {origin['provenance']} ({origin['method']}); {compared}"
+        return [text for text, so in told if so]
+    origin, why = e.data["lipschitz"], source.why if isinstance(source, Origin) else str(source)
+    found = "The constants and the curvature are" if on_curvature(e.data["form"]) else "The constants are"
+    constants = f"{found} {origin['provenance']} ({origin['method']}): with what is warned of slopes, as stated."
     if e.data["route"] == "calibrate":
         constants = "A calibrated band rests on no constants, but on points that no fit has seen: the run's order is trusted."
-    if e.data["route"] == "declared":
-        constants = "γ is what a person declares. Samples and audit had the chance to refute it."
-    sentences = [
-        "The stored residuals are those of f̂ and f: neither was run again.",
-        constants,
-        "Figures that need the model (overpowered, the constant bound, vacuous beside standing still) are as stated.",
-    ]
-    if on_curvature(e.data["form"]):
-        sentences.append("The curvature has the same origin; it was compared with second differences of neighbouring nodes.")
-    if e.data["predictor"] == "model" and e.data["form"]["form"] == "constant" and e.data["route"] == "dominate":
-        sentences.append("The constant lies above the envelope between the samples as stated: its model was not bounded again.")
-    if e.data["form"]["form"] in ("dominating", "network"):
-        sentences.append("What was proved of its functions was proved once more, on the stored data and by the same prover.")
-    if e.data["predictor"] == "model":
-        sentences.append(
-            "The predictor's values at samples and audited points are those of its model, which was not run again."
-        )
-    count = e.data["samples"]["bound"] if e.reduced else 0
-    told = {
-        "The audit's number is what the book beside the run folders counted; the book was not looked at.": "book"
-        in e.data["audit"],
-        "The audit's points were drawn by the rule before the book's format 2, from seed and number: a fit could know them.": (
-            "book" not in e.data["audit"]
+    proved = origin["provenance"] == "interval" and whole and e.data["predictor"] != "multilinear"
+    told += [
+        (f"{_ONLY}, hidden state, purity and attacks, is as stated: {why}.", not whole),
+        ("How f̂ answered when it was asked again is as stated.", whole and not e.data.get("calibration", {}).get("noise")),
+        ("The number of the audit is what the book beside the run folders counted; the book was not looked at.", True),
+        (
+            "The audit's points were drawn by the rule before the book's format 2, of seed and number: a fit could know them.",
+            "book" not in e.data["audit"],
         ),
-        "Hidden state was probed, drawn and attacked as stated: its values are not stored.": e.data.get("hidden"),
-        "The texts of the relations say what their coefficients do.": e.zone.relations,
-        "The declared symmetry holds beyond the pairs that were looked at.": e.data.get("symmetry"),
-        f"Of {count} samples those that are not stored lie within the extremes of their coarse cells.": e.reduced,
-        "The backend's draws for different seeds are independent.": noise(e),
-        "The attack's counts are as stated: its points are not stored.": e.data.get("attack"),
-    }
-    return [*sentences, *(text for text, so in told.items() if so)]
+        (constants, not proved and e.data["route"] != "declared"),
+        ("γ is what a person declares. Samples and audit had the chance to refute it.", e.data["route"] == "declared"),
+        (
+            "The constant lies above the envelope between the samples as stated: its model was not bounded again.",
+            e.data["predictor"] == "model" and e.data["form"]["form"] == "constant" and e.data["route"] == "dominate",
+        ),
+        (
+            "The predictor's values at samples and audited points are those of its model, which was not run again.",
+            e.data["predictor"] == "model" and not isinstance(source, Origin),
+        ),
+        (
+            f"Of {e.data['samples']['bound']} samples those that are not stored lie within the extremes of their coarse cells.",
+            e.reduced,
+        ),
+        ("The declared symmetry holds beyond the pairs that were looked at.", e.data.get("symmetry")),
+        ("The attack with other hidden states is as stated.", whole and "attack" in e.data.get("hidden", {})),
+        ("The backend's draws for different seeds are independent.", noise(e)),
+        ("The closed loop was not run again: its counts and traces are as stated.", (e.folder / "closed_loop.npz").exists()),
+    ]
+    return [text for text, so in told if so]
+
+
+_ONLY = "What only f̂ can tell, that residuals are those of it and of f"
+_RECORDED = "all of the recording's that begin in Z, measured when they are drawn to be, and their residuals are those of f"
+_NOBODY = "γ is what a person declares. No simulator was asked."
+
+
+def _whence(e: Evidence, allow_code: bool, engine: bool) -> Origin | str | UsageError:
+    try:
+        return origin(e.folder, allow_code, engine)
+    except UsageError as error:
+        return error
+    except (*DAMAGE, GapcertError) as error:
+        return UsageError(f"spec.json cannot be built: {type(error).__name__}: {error}")
+
+
+def _stepped_again(e: Evidence, source: Origin, n: int) -> tuple[str, Callable[[Evidence], str | None]]:
+    try:
+        name, outcome = again_of(e, source, n)
+    except (*DAMAGE, UsageError) as error:
+        name, outcome = f"{n} stored transitions are stepped again", f"{type(error).__name__}: {error}"
+    return name, lambda _: outcome
+
+
+def _specified(source: Origin | str | UsageError, e: Evidence) -> str | None:
+    return str(source) if isinstance(source, UsageError) else "" if isinstance(source, Origin) else None
+
+
+def _asked(check: Check, source: Any, e: Evidence) -> str | None:
+    """A check against the spec, where there is one."""
+    return check(e, source) if isinstance(source, Origin) and not (e.older and check in LATER) else None
+
+
+def _since(check: Callable[[Evidence], str | None]) -> Callable[[Evidence], str | None]:
+    """A check of what format 2 has the data for."""
+    return lambda e: None if e.older else check(e)
 
 
 def _attempt(check: Callable[[Evidence], str | None], evidence: Evidence) -> str | None:
@@ -160,6 +237,8 @@ def _attempt(check: Callable[[Evidence], str | None], evidence: Evidence) -> str
         return check(evidence)
     except DAMAGE as error:
         return f"the stored data are incomplete: {type(error).__name__}: {error}"
+    except GapcertError as error:
+        return str(error)
 
 
 def _packed(e: Evidence) -> str:
@@ -257,6 +336,8 @@ def _function(e: Evidence) -> str:
         "predictor", kind
     ) != kind:
         return f"'{kind}' is no predictor that is known, or not that of the function"
+    if any(f"gap.{k}" in e.arrays and (e.arrays[f"gap.{k}"] != e.arrays[f"predictor.{k}"]).any() for k in ("offset", "slope")):
+        return "the function subtracts another predictor than the certificate"
     if form == "multilinear":
         return follows(e)
     if form == "envelope":
@@ -275,6 +356,13 @@ def _function(e: Evidence) -> str:
         gamma = [float(g) for g in e.arrays["gap.gamma"]]
         return next((text for i, g in enumerate(gamma) if (text := exceeds(e, i, g))), "")
     return ""
+
+
+def _covered(e: Evidence) -> str:
+    """A cover is stated where the samples are a grid, and there alone."""
+    if (e.folder / "samples" / "bound-0" / "points.npy").exists() != (e.data["cover"] is None):
+        return "a cover is stated of other points, or the points are a grid and none is stated"
+    return "" if e.data["cover"] is None or e.covers() else "the samples are not the grid that the certificate states"
 
 
 def _drawn(e: Evidence) -> str:
@@ -326,10 +414,30 @@ def _audit(e: Evidence) -> str:
     slack = 64 * np.spacing(np.maximum(np.abs(low.lo), np.abs(high.hi)))
     possible = int(((r < low.hi + slack) | (r > high.lo - slack)).any(axis=1).sum())
     stated, above = e.data["audit"]["violations"], e.data["audit"]["gamma_violations"]
+    if text := _witnessed(e, low, high):
+        return text
     if not certain <= stated <= possible:
         return f"{certain} points lie outside for certain; {stated} were stated"
     least = int((np.abs(r) > np.maximum(np.abs(low.lo), np.abs(high.hi))).any(axis=1).sum())
     return "" if least <= above <= stated else f"|r| > γ at {least} points for certain; {above} were stated"
+
+
+def _witnessed(e: Evidence, low: Interval, high: Interval) -> str:
+    """The witness is the audited point that leaves [l, u] by most, as far as rounding leaves it open."""
+    (z, r), a = e.audit, e.data["audit"]
+    if (w := a.get("witness")) is None:
+        return "violations are stated without a witness" if a["violations"] else ""
+    rows = np.flatnonzero((z == np.asarray(w["z"])).all(axis=1))
+    if not len(rows) or w["at"] != dict(zip(e.data["domain"]["axes"], w["z"], strict=True)):
+        return "the witness is no audited point"
+    k, i = int(rows[0]), w["state"]
+    excess = np.maximum(low.mid - r, r - high.mid)
+    # The stored function rounds outwards by what its own layers or terms may leave: some times what is known here.
+    slack = 64 * np.spacing(np.abs([low.mid, high.mid]).max(axis=0)) + 8 * e.arrays["remainder.resolution"]
+    slack += 8 * np.maximum(low.hi - low.lo, high.hi - high.lo)
+    same = abs(w["low"] - low.mid[k, i]) <= slack[k, i] and abs(w["high"] - high.mid[k, i]) <= slack[k, i]
+    largest = excess[k, i] >= (excess - slack).max()
+    return "" if same and largest and w["residual"] == r[k, i] else "the witness is another point, or leaves by less"
 
 
 def _claim(e: Evidence) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +16,7 @@ import gapcert as gc
 import gapcert_functions
 from gapcert.plugin import AffinePredictor
 from gapcert.testing import GapFamilyContract
+from gapcert_bounds import stored
 from gapcert_bounds.config import BasisConfig, ConstantConfig, EnvelopeConfig
 from gapcert_bounds.families import cone
 from gapcert_bounds.families.basis import Basis, own_slope, parse, shortfall
@@ -389,3 +392,17 @@ def test_an_envelope_of_one_point_has_the_bits_of_many(nz: int, kind: str) -> No
         one = gap.interval(points[k : k + 1])
         assert np.array_equal(one[0][0], low[k])
         assert np.array_equal(one[1][0], high[k])
+
+
+@pytest.mark.parametrize("affine", [False, True])
+@pytest.mark.parametrize("family", [Envelope(), Constant(), Multilinear(), Basis(FUNCTIONS)], ids=lambda f: f.name)
+def test_what_was_saved_answers_to_the_same_bits(family, affine: bool) -> None:
+    route = "theorem1" if family.name == "basis" else "dominate"
+    problem = gap_problem(Waves.smooth(), (5, 4, 3), route=route, affine=affine and route == "dominate")
+    made, file = family.fit(problem), io.BytesIO()
+    np.savez(file, **made.arrays())
+    file.seek(0)
+    again = stored(json.loads(json.dumps(made.form)), np.load(file), problem.domain.zone)
+    z = problem.domain.draw(300, np.random.default_rng(11))
+    for points in (z, z[:1]):
+        assert all(np.array_equal(a, b) for a, b in zip(made.interval(points), again.interval(points), strict=True))

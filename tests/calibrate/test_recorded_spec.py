@@ -236,7 +236,13 @@ def test_tosses_of_a_cube_beside_free_fall(tmp_path: Path) -> None:
     c = done.certificate
     assert isinstance(c, gc.CalibratedRecording)
     assert (c.claim.epsilon, c.claim.beta) == (0.05, 0.01)
-    assert (c.units, len(c.held), c.rank) == (364, 243, 239)  # 14 of the 379 tosses are in the data twice
+    assert (c.units, len(c.held), c.rank) == (364, 243, 239)
+    told = (
+        "14 of 379 trajectories are copies of others and count once: '140' is a copy of '56', '301' of '172', '302' of '173', "
+    )
+    assert c.warnings == [f"{told}and 11 more"]
+    copies = done.summary["certificate"]["recording"]["copies"]
+    assert (len(copies), copies[1]["name"], copies[1]["of"], {k["whole"] for k in copies}) == (14, "301", "172", {True})
     low, high = c.gap.interval(c.held.z)
     out = c.held.window[((c.held.r < low) | (c.held.r > high)).any(axis=1)]
     assert len(np.unique(out)) == 243 - 239

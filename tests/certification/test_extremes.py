@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from forgeries import Forger, Forgery
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -166,6 +167,7 @@ def damage(folder, how):
     certificate = json.loads((folder / "certificate.json").read_text())
     certificate["digests"]["bound-0"] = hashlib.sha256(json.dumps([lines[0], entries]).encode()).hexdigest()
     (folder / "certificate.json").write_text(json.dumps(certificate))
+    Forger(np.random.default_rng(0)).mend(folder, Forgery("samples"))
 
 
 def test_verify_takes_part(tmp_path):
@@ -177,7 +179,7 @@ def test_verify_takes_part(tmp_path):
     assert verify_run(done.folder)["verdict"] == "holds"
     damage(done.folder, "left out")
     failed = [c["detail"] for c in verify_run(done.folder)["checks"] if not c["passed"]]
-    assert failed == ["the samples are not the grid that the certificate states"]
+    assert "the samples are not the grid that the certificate states" in failed
 
 
 def test_a_changed_shard_is_seen(tmp_path):

@@ -91,7 +91,7 @@ def test_what_jitters_is_found_and_covered_and_said(lost, size, tmp_path):
     assert c.claim.kind == "deterministic"
     assert outside(c, engine, 1) == 0
     said = next(a for a in c.assumptions if "within e" in a)
-    assert "of f̂ it is measured, not proved: it covers twice what answers a few ulp apart leave a parabola by" in said
+    assert "of f̂ it is measured, not proved: it covers twice what close answers leave a parabola by, " in said
     assert "e(x) of f̂ is twice its jitter, which is more than is stated." in said
     assert "e(x) of f̂ is twice its jitter, which is more than is stated." in told
 

@@ -308,10 +308,10 @@ def test_a_reader_that_goes_away_is_no_error(tmp_path):
 
 def test_verify_returns_its_verdict(monkeypatch, capsys, tmp_path):
     checks = [{"check": "audit", "passed": False, "detail": "3 points outside"}]
-    monkeypatch.setattr("gapcert_verify.verify_run", lambda folder, *more: {"verdict": "fails", "checks": checks})
+    monkeypatch.setattr("gapcert_verify.verify_run", lambda folder, *more, **asked: {"verdict": "fails", "checks": checks})
     assert main(["verify", str(tmp_path)]) == 1
     assert "FAILED  audit  3 points outside" in capsys.readouterr().out
-    monkeypatch.setattr("gapcert_verify.verify_run", lambda folder, *more: {"verdict": "holds", "checks": []})
+    monkeypatch.setattr("gapcert_verify.verify_run", lambda folder, *more, **asked: {"verdict": "holds", "checks": []})
     assert main(["verify", str(tmp_path), "--json"]) == 0
     assert one_object(capsys.readouterr().out)["verdict"] == "holds"
 

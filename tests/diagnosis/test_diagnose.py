@@ -259,8 +259,9 @@ def test_what_is_held_out_is_not_fitted_under_another_name():
     log = replace(recording, trajectories=(again, other, named["one"]))
     said = []
     found = find(model, log, FRICTIONS, hold_out={"trajectories": ["one"]}, horizons=[0.5], emit=said.append)
-    told = "what is in the recording twice counts once: 'again' is a copy of 'one'"
+    told = "1 of 3 trajectories is a copy and counts once: 'again' is a copy of 'one'"
     assert told in found.assumptions
+    assert found.summary()["log"]["copies"] == [{"name": "again", "of": "one", "start": 30.0, "rows": len(tr), "whole": True}]
     assert any(e.data.get("message") == told for e in said)
     alone = find(
         model, replace(log, trajectories=(other, named["one"])), FRICTIONS, hold_out={"trajectories": ["one"]}, horizons=[0.5]

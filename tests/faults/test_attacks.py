@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from faults import LINE, TINY, clean, contents, gapcert, soon, told, written
+from forgeries import Forger, Forgery
 
 import gapcert as gc
 from gapcert.cli.main import main
@@ -613,8 +614,13 @@ def test_names_in_a_program(run_folder, tmp_path, capsys):
 @attack("a saved run", "its model is Python, and a log is checked against it")
 def test_a_run_whose_model_is_code(run_folder, tmp_path, capsys, canary, foreign):
     data = json.loads((run_folder / "spec.json").read_text())
-    (run_folder / "spec.json").write_text(json.dumps({**data, "model": foreign}))
-    (run_folder / "run.json").write_text(json.dumps({"spec": "", "folder": str(tmp_path)}))
+    # It has the names of the model that it replaces: what is refused is that it is code.
+    of = {k: data["model"][k] for k in ("states", "inputs", "period")}
+    (run_folder / "spec.json").write_text(json.dumps({**data, "model": {**foreign, **of}}))
+    mark = json.loads((run_folder / "run.json").read_text())
+    (run_folder / "run.json").write_text(json.dumps({**mark, "folder": str(tmp_path)}))
+    Forger(np.random.default_rng(0)).mend(run_folder, Forgery("spec.json:model"))
+    assert not canary.exists()
     (tmp_path / "log.csv").write_text("t,x,u\n0,0,0\n1,0,0\n")
     told(capsys, "check", str(run_folder), str(tmp_path / "log.csv"), says="--allow-code")
     assert not canary.exists()

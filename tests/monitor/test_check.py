@@ -1,6 +1,7 @@
 """New measurements against a certificate: what is judged, what is passed over, and what noise excuses."""
 
 import json
+import sys
 from dataclasses import replace
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 import gapcert as gc
 from gapcert.cli.main import main
 from gapcert.testing.toys import Drift, Perturbed, ripple, ripple_lipschitz
-from gapcert_monitor.check import check, rate_limit, tolerated
+from gapcert_monitor.check import check, in_words, rate_limit, tolerated
 from gapcert_recordings.transitions import Transitions
 
 RANGES = {"x0": (-1.0, 1.0), "u0": (-2.0, 2.0)}
@@ -242,7 +243,9 @@ def test_a_log_that_is_given_twice_counts_once(certificate):
     again = gc.Trajectory(t + 50, {"x0": np.round(x, 6), "u0": np.round(u, 6)}, "later")
     found = certificate.check(gc.Recording((tr, again)))
     assert found.points == certificate.check(recording(t, x, u)).points
-    assert found.copies == ("'later' is a copy of '0'",)
+    assert found.copies.told == "1 of 2 trajectories is a copy and counts once: 'later' is a copy of '0'"
+    assert [(c["name"], c["of"], c["whole"]) for c in found.summary()["copies"]] == [("later", "0", True)]
+    assert f"  {found.copies.told}" in in_words(found)
 
 
 def test_one_step_of_the_monitor_is_the_certificate_at_that_point(certificate):
@@ -335,8 +338,8 @@ def test_a_runs_folder_says_what_its_certificate_says(run, tmp_path):
     certified = gc.Certified.load(run.folder)
     z = run.certificate.domain.draw(200, np.random.default_rng(0))
     (low, high), (lo, hi) = certified.band(z), run.certificate.gap.interval(z)
-    np.testing.assert_allclose(low, lo, rtol=1e-9, atol=1e-14)
-    np.testing.assert_allclose(high, hi, rtol=1e-9, atol=1e-14)
+    assert np.array_equal(low, lo)
+    assert np.array_equal(high, hi)
     backend = gc.load_spec(SPEC).build("backend")
     for turns in (0, 2):
         found = gc.check(certified, gc.read_log(log(tmp_path / "log.csv", swing(backend, turns)), certified))
@@ -344,6 +347,48 @@ def test_a_runs_folder_says_what_its_certificate_says(run, tmp_path):
         if turns == 0 or run.certificate.problem.predictor.kind != "model":
             assert found.verdict == "holds"
         assert found.points == 149
+
+
+BANDS: dict[str, dict[str, Any]] = {
+    "affine": {},
+    "basis": {
+        "gap": {"kind": "basis", "functions": ["1", "abs(omega)"]},
+        "sampling": {"kind": "grid", "counts": {"theta": 5, "omega": 9, "drive": 3}},
+        "certificate": SPEC["certificate"] | {"route": "theorem1"},
+    },
+    "multilinear": {
+        "gap": {"kind": "multilinear", "predictor": "none"},
+        "sampling": {"kind": "lattice", "budget": 60},
+        "lipschitz": {"residual": {"kind": "interval", "curvature": True}},
+    },
+    "cells": {"lipschitz": {"residual": {"kind": "piecewise"}}, "gap": {"kind": "envelope", "predictor": "none"}},
+    "calibrated": {"certificate": SPEC["certificate"] | {"route": "calibrate"}},
+}
+
+
+@pytest.mark.exam
+@pytest.mark.parametrize("more", BANDS.values(), ids=BANDS)
+def test_a_monitor_of_a_folder_says_what_that_of_its_certificate_says(more, tmp_path, monkeypatch):
+    """To the last bit, also where a residual is as large as γ to some of them."""
+    done = gc.run(SPEC | more, out=tmp_path)
+    model, certified, rng = done.certificate.model, gc.Certified.of(done.certificate), np.random.default_rng(7)
+    x, u = np.split(done.certificate.domain.draw(300, rng), [2], axis=1)
+    after, gamma = model.step(x, u).x, done.certificate.gamma(x, u)
+    after += np.sign(rng.normal(size=x.shape)) * gamma + rng.integers(-2, 3, x.shape) * np.spacing(after)
+
+    def said(by):
+        monitor = by.monitor()
+        seen = [monitor.step(*row) for row in zip(x, u, after, strict=True)]
+        return [(o.violated, o.inside, o.residual.tolist(), o.gamma.tolist()) for o in seen]
+
+    own = said(certified)
+    assert {violated for violated, *_ in own} == {True, False}
+    assert said(gc.Certified.load(done.folder)) == own
+    monkeypatch.setattr(sys.modules["gapcert_monitor.check"], "stored", lambda *_: None)
+    around = said(gc.Certified.load(done.folder))
+    assert np.allclose([o[3] for o in around], gamma, rtol=1e-9, atol=1e-14)
+    if not more:
+        assert [o[0] for o in around] != [o[0] for o in own]
 
 
 @pytest.mark.run

@@ -11,7 +11,6 @@ from recorded_twice import FORMS, WAYS, drawn
 
 import gapcert as gc
 from gapcert_recordings import Copies, copies
-from gapcert_recordings.thresholds import THRESHOLDS
 
 Array = np.ndarray
 
@@ -73,8 +72,33 @@ def test_a_hundred_times_the_same_is_one() -> None:
     many = gc.Recording(tuple(log(40, 3, f"{k}") for k in range(100)))
     copied = Copies.of(many)
     assert len(copied.without(many).trajectories) == 1
-    assert len(copied.told) == THRESHOLDS.copies_told + 1
-    assert copied.told[-1] == "and 89 more"
+    assert len(copied.summary()) == 99
+    assert copied.told == (
+        "99 of 100 trajectories are copies of others and count once: '1' is a copy of '0', '2' of '0', '3' of '0', and 96 more"
+    )
+
+
+def test_they_are_told_in_one_sentence_those_that_are_whole_first() -> None:
+    a, b = log(100, 0, "a"), log(80, 1, "b")
+    mixed = {n: np.concatenate([a.channels[n][30:60], b.channels[n][:20]]) for n in a.channels}
+    mixed_in = gc.Trajectory(0.1 * np.arange(50) + 7, mixed, "mixed")
+
+    def told(*trajectories: gc.Trajectory, within: bool = False) -> str:
+        return Copies.of(gc.Recording(trajectories), ("u",), within=within).told
+
+    assert told(a, b) == ""
+    parts = "'mixed' has 30 rows from 7 s on that are a copy of rows of 'a', "
+    assert told(a, b, mixed_in).startswith(
+        f"1 of 3 trajectories has rows that are a copy and counts once: {parts}'mixed' has 20"
+    )
+    both = told(a, b, mixed_in, replace(b, name="c"))
+    assert both.startswith(
+        f"2 of 4 trajectories have rows that are copies of others and count once: 'c' is a copy of 'b', {parts}"
+    )
+    rows = Copies.of(gc.Recording((a, b, mixed_in)), ("u",)).summary()
+    assert rows[0] == {"name": "mixed", "of": "a", "start": 7.0, "rows": 30, "whole": False}
+    twice = gc.Trajectory(0.1 * np.arange(200), {n: np.tile(v, 2) for n, v in a.channels.items()})
+    assert told(twice, within=True).startswith("1 of 1 trajectories has rows that are a copy and counts once: '0' has 100 rows")
 
 
 def test_logs_that_stand_still_are_no_copies() -> None:

@@ -112,6 +112,49 @@ def test_the_bands_are_those_of_the_certificate(small_run):
         assert {f"{b.axis.name} [{b.axis.unit}]", f"gap of {b.state} [{b.unit}]"} <= set(labels)
 
 
+@pytest.mark.parametrize("refuted", [False, True])
+def test_a_refuted_band_is_not_filled_nor_is_one_that_is_empty(refuted, tmp_path):
+    from gapcert_figures.data import Axis, Band, GapFigure, Slice
+    from gapcert_rerun.stream import Stream
+
+    at = np.linspace(-3.0, 4.0, 71)
+    low, high, gamma = np.full(71, -0.4), 0.5 - 0.3 * np.abs(at), np.full(71, 0.7)
+    band = Band("w", "rad/s", Axis("a", "1", -3.0, 4.0), at, 0 * at, low, high, gamma, 0.8)
+    maps = (Slice("w", "rad/s", np.ones((5, 5)), np.zeros((5, 5))),)
+    path, stream = tmp_path / "run.rrd", Stream({"rerun": str(tmp_path / "run.rrd"), "name": "n"})
+    figure = GapFigure((band.axis, Axis("b", "1", 0.0, 1.0)), "", maps, (band,), np.zeros((1, 2)))
+    stream.receive(gc.Event("stage-finished", "certificate", {"figure": figure, "refuted": refuted}))
+    stream.close()
+    paths = {str(c.entity_path) for c in chunks(path)}
+    filled = {p.rpartition("/")[2] for p in paths if p.startswith("/band/w/a/")} & {"gamma", "envelope"}
+    assert filled == (set() if refuted else {"gamma", "envelope"})
+    empty = np.flatnonzero(low > high)
+    for side, end in (("low", low), ("high", high)):
+        strips = [np.asarray(s) for s in column(path, f"/band/w/a/envelope_{side}", "strips")[0]]
+        assert sum(map(len, strips)) == (71 if refuted else len(empty))
+        shown = np.concatenate(strips)[:, 1] * 2 * 1.15 * 0.8 - 1.15 * 0.8
+        assert np.allclose(shown, end if refuted else end[empty], atol=1e-6)
+    if not refuted:
+        corners = np.unique(np.asarray(column(path, "/band/w/a/envelope", "triangle_indices")[0]) // 2)
+        assert set(corners.tolist()) == set(range(71)) - set(empty.tolist())
+    marks = column(path, "/band/w/a/frame", "labels")[0]
+    assert ("refuted; no band: l above u" if refuted else "no band: l above u") in marks
+    names = column(path, "/gap/w/gamma/frame", "labels")[0]
+    assert ("refuted γ, and samples" in names, "certified γ, and samples" in names) == (refuted, not refuted)
+
+
+@pytest.mark.exam
+def test_what_is_refuted_is_drawn_as_that_from_end_to_end(small_spec, tmp_path):
+    """Constants of which a fiftieth is taken."""
+    spec = {k: small_spec[k] for k in ("version", "name", "model", "backend", "domain", "gap")}
+    less = {"lipschitz": {"residual": {"kind": "wood-zhang", "safety": 0.02}}, "report": {"rerun": True}}
+    done = gc.run({**spec, **less, "certificate": {"claim": "statistical"}}, out=tmp_path)
+    assert done.summary["verdict"] == "fails"
+    paths = {str(c.entity_path) for c in chunks(done.folder / "run.rrd")}
+    assert "/band/omega/theta/envelope_low" in paths
+    assert "/band/omega/theta/envelope" not in paths
+
+
 def test_a_run_is_alive_until_the_step_at_which_it_breaks(small_run):
     for runs in Figures.load(small_run.folder).loop.runs:
         alive = flat(column(small_run.folder / "run.rrd", f"/alive/with{'' if runs.gamma else 'out'}_gamma", "scalars"))
@@ -208,6 +251,8 @@ sys.modules["gapcert_rerun.stream"].PATIENCE = 0.5
 viewer = plugin._STREAM.get()._viewer
 time.sleep(0.3)
 os.killpg(viewer.process.pid, getattr(signal, sys.argv[1]))
+# Which takes a process of many threads some milliseconds.
+sys.argv[1] == "SIGKILL" and viewer.process.wait(5)
 plugin.gapcert_event(gc.Event("run-finished", "run", {"summary": {"name": "n", "verdict": "holds"}}))
 viewer.process.wait(5)
 """

@@ -15,7 +15,7 @@ from gapcert.contracts.gaps.lipschitz import Residual
 
 SEED = 11
 FEW = {"networks": (4, 3000), "formulas": (60, 20)}
-MORE = {"certificates": 16, "games": 12, "mpc": 4, "networks": 40, "formulas": 1000, "calibrations": 4}
+MORE = {"certificates": 16, "games": 12, "mpc": 4, "networks": 40, "formulas": 1000, "calibrations": 4, "forgeries": 3}
 
 
 def broken(kind: str, first: int, claims: int, tries: int | None) -> list[dict]:

@@ -142,7 +142,7 @@ class _Watch:
 
     def _path(self, event: str, path: object) -> None:
         text = os.fsdecode(path) if isinstance(path, str | bytes | os.PathLike) else ""
-        allowed = ("/dev/null", "__pycache__", "matplotlib", "numba")
+        allowed = ("/dev/null", "__pycache__", "matplotlib", "numba", "gapcert/verify")
         if text and not any(a in text for a in allowed) and not os.path.abspath(text).startswith(str(self.folder)):
             self.heard.append(f"{event} {text}")
 

@@ -228,10 +228,15 @@ class Statement(ABC):
         return gapcert.Monitor(gapcert.Certified.of(self))
 
 
+FORMAT = 2
+"""Of what `save` writes: 1, which was not told, had no units and no period beside Z."""
+
+
 class SavedStatement(Statement, Shown):
     """One that holds its gap function: it is shown, and saved."""
 
     gap: GapFunction
+    model: Model | None
     versions: Mapping[str, str]
 
     @abstractmethod
@@ -243,9 +248,10 @@ class SavedStatement(Statement, Shown):
         content = npz_bytes({**{f"gap.{k}": v for k, v in self.gap.arrays().items()}, **arrays})
         data = {
             **self.summary(),
+            "format": FORMAT,
             "form": dict(self.gap.form),
             "predictor": predictor,
-            "domain": domain_data(self._about()[0]),
+            "domain": domain_data(self._about()[0], self.model),
             "arrays": hashlib.sha256(content).hexdigest(),
             "versions": dict(self.versions),
             **more,
@@ -374,11 +380,15 @@ class Certificate(SavedStatement):
         )
 
 
-def domain_data(domain: Domain) -> dict[str, Any]:
-    """Z as it is stored: names, how many are states, ends and relations."""
+def domain_data(domain: Domain, model: Model | None) -> dict[str, Any]:
+    """Z as it is stored: names, units, how many are states, ends and relations; the model's period and relative inputs."""
+    relative = getattr(model, "relative", None)
     return {
         "axes": [a.name for a in domain.axes],
+        "units": [a.unit for a in domain.axes],
         "states": domain.nx,
+        "period": None if model is None else model.period,
+        "coordinates": {} if relative is None else dict(zip((a.name for a in relative.axes), relative.texts, strict=True)),
         "low": domain.low.tolist(),
         "high": domain.high.tolist(),
         "relations": [{"text": r.text, "a": list(r.coefficients), "b": r.bound} for r in domain.relations],

@@ -101,7 +101,7 @@ def certify(
 
     plan = replace(hidden or HiddenPlan(), ignore=(*(hidden or HiddenPlan()).ignore, *symmetries))
     gate = entry.enter(model, drawn, domain, plan, request.claim, executor, seed, emit)  # r = f̂ − f is a function of (x, u)
-    gate = replace(gate, turns=repeating(model, backend, domain, seed))  # where angles close on themselves, of the circle
+    gate = replace(gate, turns=repeating(model, backend, domain, seed), jitter=gate.jitter if drawn is backend else None)
     with Kept(executor) as pools:
         key = digest(model, gate.system, domain)
         store = Store(Path(folder) / "samples", Residual(gate.system, model), key, pools, sampling.chunk, emit)

@@ -144,10 +144,11 @@ def declared(problem: GapProblem, gap: GapFunction, residual: Residual, assumed:
                 _held(asked, replace(zone, low=ends[0], high=ends[1]), [j], 2, every, "lipschitz: curvature")
 
 
-def by_audit(problem: GapProblem, z: Array, r: Array, most: int = 1_000) -> dict[str, Any] | None:
-    """Two points, one of the audit, that contradict declared constants or a declared symmetry; None where nothing was."""
+def by_audit(problem: GapProblem, z: Array, r: Array, most: int = 16_000_000) -> dict[str, Any] | None:
+    """A point of the audit and a sample, of `most` such pairs, that contradict declared constants or a declared symmetry."""
     if problem.lipschitz.provenance != "declared" and problem.symmetry is None:
         return None
-    own, pick = problem.samples, np.linspace(0, len(problem.samples) - 1, min(most, len(problem.samples))).astype(int)
+    own, count = problem.samples, min(most // len(z) + 1, len(problem.samples))
+    pick = np.linspace(0, len(own) - 1, count).astype(int)
     both = Samples(np.concatenate([own.z[pick], z]), np.concatenate([own.r[pick], r]))
     return contradiction(replace(problem, samples=both), len(both), np.arange(len(pick)), noise=4)

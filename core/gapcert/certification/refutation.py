@@ -19,7 +19,7 @@ from gapcert.numerics.arrays import Array, Bools, Ints
 from gapcert.numerics.interpolation import on_curvature
 from gapcert.numerics.order_statistics import NO_CONSTANTS
 
-_PAIRS = 1_000_000  # that are looked at together
+_PAIRS = 100_000  # that are looked at together
 ADVICE = "use lipschitz.residual: {kind: piecewise}"
 
 
@@ -37,14 +37,12 @@ def contradiction(
     spread = problem.resolution - problem.arithmetic
     noise = 4 if suspects is None else noise
     slack = noise * problem.remainder_resolution - (noise - 2) * spread
-    worst: dict[str, Any] | None = None
+    found = list[dict[str, Any] | None]()
     for rows, constants, jumps in _parts(problem.lipschitz, z):
         pick = rows[np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(int)] if suspects is None else rows
-        first = None if suspects is None else np.flatnonzero(np.isin(pick, suspects))
-        found = _worst_pair(z[pick], r[pick] - problem.predictor(z[pick]), constants, jumps + slack, first)
-        if found is not None and found["excess"] > (worst["excess"] if worst else 0.0):
-            worst = found
-    return worst
+        first = np.arange(len(pick)) if suspects is None else np.flatnonzero(np.isin(pick, suspects))
+        found.append(_worst_pair(z[pick], r[pick] - problem.predictor(z[pick]), constants, jumps + slack, first))
+    return max(filter(None, found), key=lambda pair: pair["excess"], default=None)
 
 
 def _parts(bound: LipschitzBound, z: Array) -> Iterator[tuple[Any, Array, Array]]:
@@ -56,20 +54,18 @@ def _parts(bound: LipschitzBound, z: Array) -> Iterator[tuple[Any, Array, Array]
         yield rows, bound.cells.constants[c], bound.cells.jumps[c]
 
 
-def _worst_pair(z: Array, g: Array, constants: Array, slack: Array, first: Any = None) -> dict[str, Any] | None:
-    """Among all pairs, or those that begin with a row of `first`."""
+def _worst_pair(z: Array, g: Array, constants: Array, slack: Array, first: Ints) -> dict[str, Any] | None:
+    """Among the pairs that begin with a row of `first`."""
     worst: dict[str, Any] | None = None
-    first = np.arange(len(z)) if first is None else first
-    block = max(1, _PAIRS // max(1, len(z)))
-    for i in range(g.shape[1] if len(z) else 0):
-        for a in range(0, len(first), block):
-            rows = first[a : a + block]
-            allowed = (np.abs(z[rows, None] - z[None]) * constants[i]).sum(axis=2)
-            excess = np.abs(g[rows, None, i] - g[None, :, i]) - allowed * (1 + 1e-12) - slack[i] * (1 + 1e-12)
-            k, m = np.unravel_index(int(np.argmax(excess)), excess.shape)
-            if excess[k, m] > (worst["excess"] if worst else 0.0):
-                worst = {"state": i, "z": z[rows[k]].tolist(), "other": z[m].tolist(), "excess": float(excess[k, m])}
-                worst |= {"change": float(abs(g[rows[k], i] - g[m, i])), "allowed": float(allowed[k, m] + slack[i])}
+    block, finite = max(1, _PAIRS // max(1, len(z))), np.minimum(constants, 1e300)
+    for a in range(0, len(first), block):
+        rows = first[a : a + block]
+        allowed, change = np.abs(z[rows, None] - z[None]) @ finite.T, np.abs(g[rows, None] - g[None])
+        excess = change - (allowed + slack) * (1 + 1e-12)
+        at = k, m, i = np.unravel_index(int(np.argmax(excess)), excess.shape)
+        if excess[at] > (worst["excess"] if worst else 0.0):
+            worst = {"state": int(i), "z": z[rows[k]].tolist(), "other": z[m].tolist(), "excess": float(excess[at])}
+            worst |= {"change": float(change[at]), "allowed": float(allowed[at] + slack[i])}
     return worst
 
 

@@ -24,14 +24,8 @@ COMMANDS = (
     _command(
         "schema",
         "print the JSON Schema of a spec, or put it where editors find it",
-        Argument(
-            "--install", "into the folder of your editor (.)", {"nargs": "?", "const": Path(), "type": Path, "metavar": "DIR"}
-        ),
-        Argument(
-            "--modeline",
-            "name it at a spec's top",
-            {"action": "append", "default": [], "type": Path, "metavar": "SPEC"},
-        ),
+        Argument("--install", "into your editor's folder (.)", {"nargs": "?", "const": Path(), "type": Path, "metavar": "DIR"}),
+        Argument("--modeline", "name it at a spec's top", {"action": "append", "default": [], "type": Path, "metavar": "SPEC"}),
     ),
     _command("plugins", "list what is installed and what is missing, or begin a plugin"),
     _command(

@@ -146,6 +146,12 @@ class Build:
 
     def certify(self, model: Model, backend: System, domain: Domain, folder: Path, emit: Emit) -> Certificate:
         """The certificate that the spec asks for, of any model; by default an empirical one."""
+        where: dict[str, Any] = {"folder": folder, "ledger": self.out / "ledger.json", "executor": self.executor()}
+        made = certify(**self.asked(model, backend, domain), **where, emit=emit)
+        return replace(made, versions={**made.versions, **self.versions()})
+
+    def asked(self, model: Model, backend: System, domain: Domain) -> dict[str, Any]:
+        """What `certify` is asked, by the names of its arguments."""
         c, asked = self.spec.config, self.spec.config.certificate
         family = self.family()
         request = (
@@ -158,26 +164,21 @@ class Build:
         question, axes = Fingerprint(model, backend, domain), [a.name for a in domain.axes]
         extended = self.predictor(family, backend, domain)
         model, backend, domain = self.relative(model, backend, domain)
-        made = certify(
-            model,
-            backend,
-            domain,
-            question=question,
-            sampling=None if c.sampling is None and "seed" in backend.capabilities else self.sampling(domain, axes),
-            lipschitz=self.make("lipschitz.residual") if "residual" in c.lipschitz else None,
-            family=family,
-            predictor=extended,
-            route=asked.route if asked is not None else None,
-            request=request,
-            symmetries=c.symmetries.translation if c.symmetries is not None else (),
-            hidden=self.plan(backend),
-            seed=c.seed,
-            folder=folder,
-            ledger=self.out / "ledger.json",
-            executor=self.executor(),
-            emit=emit,
-        )
-        return replace(made, versions={**made.versions, **self.versions()})
+        return {
+            "model": model,
+            "backend": backend,
+            "domain": domain,
+            "question": question,
+            "sampling": None if c.sampling is None and "seed" in backend.capabilities else self.sampling(domain, axes),
+            "lipschitz": self.make("lipschitz.residual") if "residual" in c.lipschitz else None,
+            "family": family,
+            "predictor": extended,
+            "route": asked.route if asked is not None else None,
+            "request": request,
+            "symmetries": c.symmetries.translation if c.symmetries is not None else (),
+            "hidden": self.plan(backend),
+            "seed": c.seed,
+        }
 
     def declare(self, model: Model, domain: Domain) -> Declaration:
         """γ as the spec states it, where it names no backend."""

@@ -21,7 +21,9 @@ from gapcert.numerics.errors import UsageError
 if TYPE_CHECKING:
     from gapcert.spec.spec import Spec
 
-MARK, SPEC, LOCK = "run.json", "spec.json", "run.lock"
+MARK, SPEC, LOCK, ROOT = "run.json", "spec.json", "run.lock", "root.json"
+# What has digests of its own, changes after a run, or is made again of the rest.
+_APART = {ROOT, LOCK, "samples", "fit", "beside", "progress.jsonl", "report.html", "run.rrd"}
 
 
 def place(spec: Spec, out: Path) -> Path:
@@ -132,6 +134,15 @@ def _changes(files: Mapping[str, str], home: Path) -> str:
 
 def _sha256(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def sealed(folder: Path) -> dict[str, Any]:
+    """{"files": {path: SHA-256}, "root": SHA-256 of these}: what ties a run together. Rounds of samples have their digests in
+    the certificate. The root finds damage; a forger makes it anew.
+    """
+    found = (p.relative_to(folder) for p in sorted(folder.rglob("*")) if p.is_file() and p.suffix != ".tmp")
+    files = {p.as_posix(): _sha256(folder / p) for p in found if not _APART & {*p.parts}}
+    return {"files": files, "root": hashlib.sha256(json.dumps(files, sort_keys=True).encode()).hexdigest()}
 
 
 @contextmanager

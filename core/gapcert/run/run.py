@@ -24,7 +24,7 @@ from gapcert.contracts.systems.system import Model
 from gapcert.numerics.atomic_files import write_atomic
 from gapcert.numerics.errors import Undecided, UsageError
 from gapcert.run.build import Build
-from gapcert.run.folder import enter, opened, owned, place, spec_of
+from gapcert.run.folder import ROOT, enter, opened, owned, place, sealed, spec_of
 from gapcert.run.journal import Journal
 from gapcert.run.status import RunFolder
 from gapcert.run.verdict import beside_nominal, code_of, nothing_won, refutations
@@ -178,6 +178,7 @@ def _execute(build: Build, folder: Path, journal: Journal, observers: Sequence[E
         summary["expectations"] = evaluate_expectations(spec.config.expect, summary)
     write_atomic(folder / "summary.json", json.dumps(summary, indent=1, default=str).encode())
     stages.emit(Event("run-finished", "run", {"summary": summary, "folder": folder}))
+    write_atomic(folder / ROOT, json.dumps(sealed(folder), indent=1).encode())
     if spec.config.report.html:
         journal(Event("stage-started", "report"))
         registry().get("report", "html").load()(folder)

@@ -414,7 +414,7 @@ class _Kept:
     """How far a proof has come, in the user's own cache: a folder of somebody else's says nothing that would be believed."""
 
     def __init__(self, path: Path | None) -> None:
-        self.path, self.begin, self._last = path, 0, 0.0
+        self.path, self.begin, self._last = path, 0, time.monotonic()
         if path is not None:
             with suppress(OSError, ValueError):
                 if path.stat().st_uid == os.geteuid():
@@ -434,18 +434,19 @@ class _Kept:
             total.update(hashlib.sha256(path.read_bytes() if path.is_file() else b"").digest())
         try:
             home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gapcert" / "verify"
-            home.mkdir(mode=0o700, parents=True, exist_ok=True)
-            return cls(home / total.hexdigest() if home.stat().st_uid == os.geteuid() else None)
-        except (OSError, RuntimeError):
-            return cls(None)  # nothing is kept then
+        except RuntimeError:
+            return cls(None)  # nobody's home: nothing is kept
+        return cls(home / total.hexdigest())
 
     def done(self, count: int, total: int) -> None:
         """Keep it, at most every other second; what is finished is forgotten."""
         if self.path is None or (time.monotonic() - self._last < PAUSE and count < total):
             return
-        self._last = time.monotonic()
+        self._last, home = time.monotonic(), self.path.parent
         with suppress(OSError):
-            if count < total:
-                write_atomic(self.path, str(count).encode(), flush=False)
-            else:
+            if count == total:
                 self.path.unlink(missing_ok=True)
+                return
+            home.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if home.stat().st_uid == os.geteuid():
+                write_atomic(self.path, str(count).encode(), flush=False)

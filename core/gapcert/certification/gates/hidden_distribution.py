@@ -28,8 +28,7 @@ Range = tuple[float, float]
 
 def columns(specs: tuple[StateSpec, ...]) -> list[slice]:
     """Which columns of a hidden array each hidden state occupies."""
-    ends = np.cumsum([0, *(s.size for s in specs)]).tolist()
-    return [slice(a, b) for a, b in itertools.pairwise(ends)]
+    return [slice(a, b) for a, b in itertools.pairwise(np.cumsum([0, *(s.size for s in specs)]).tolist())]
 
 
 def default(system: System, n: int) -> Array:

@@ -99,7 +99,7 @@ class Gate:
 
     `system` is what is sampled, `bound` (nx,) the spread that acts as further resolution; it cost `spent` transitions.
     `audited`, if set, is asked by the audit instead: hidden state that a probe found harmless is drawn there all the same.
-    `first`: see `purity.answered`; `jitter`: see `entry.jitter`.
+    `first`: see `purity.answered`; `jitter`: see `entry.jitter`, none of noise that is drawn.
     """
 
     plan: HiddenPlan
@@ -230,8 +230,7 @@ def probe(residual: Residual, domain: Domain, ranges: Mapping[str, Range], pool:
     z = domain.draw(THRESHOLDS.hidden_together, rng)
     x, u = (np.ascontiguousarray(part) for part in domain.split(z))
     groups = [(x[:rows], u[:rows], moved(backend, rows, rng, ranges, (n,))) for n in names]
-    groups.append((x, u, moved(backend, len(x), rng, ranges)))
-    groups.append(_met(domain, pool, rng))
+    groups += [(x, u, moved(backend, len(x), rng, ranges)), _met(domain, pool, rng)]
     at = [np.concatenate(parts) for parts in zip(*groups, strict=True)]
     plain, other = backend.step(at[0], at[1]).x, backend.step(at[0], at[1], hidden=at[2]).x
     if (lost := ~np.isfinite(other).all(axis=1)).any():

@@ -26,10 +26,7 @@ Provenance = Literal["analytic", "interval", "declared", "estimated"]
 @final
 @dataclass(frozen=True)
 class Residual:
-    """r(z) = f̂(z) − f(z), state by state, in the geometry of each state (angles on the circle).
-
-    Calling it with z (n, nx + nu) returns r (n, nx).
-    """
+    """r(z) = f̂(z) − f(z), (n, nx) of z (n, nx + nu), state by state, in the geometry of each state (angles on the circle)."""
 
     backend: System
     model: Model

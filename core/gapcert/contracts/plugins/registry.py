@@ -160,17 +160,17 @@ def discover(entry_points: Iterable[importlib.metadata.EntryPoint]) -> Registry:
     manager = pluggy.PluginManager("gapcert")
     manager.add_hookspecs(sys.modules[__name__])
     components, broken = [replace(c, distribution=_OWN) for c in BUILTIN], []
-    for point in sorted(entry_points, key=lambda p: (_owner(p), p.name)):
+    for owner, point in sorted(((_owner(p), p) for p in entry_points), key=lambda pair: (pair[0], pair[1].name)):
         try:
             module = point.load()
             # Keyed by distribution as well: two distributions may use one entry-point name without shadowing each other.
-            manager.register(module, name=f"{_owner(point)}:{point.name}")
-            declared = [replace(c, distribution=_owner(point)) for c in getattr(module, "gapcert_components", list)()]
+            manager.register(module, name=f"{owner}:{point.name}")
+            declared = [replace(c, distribution=owner) for c in getattr(module, "gapcert_components", list)()]
             if strange := {c.kind for c in declared} - {*KINDS, *INNER}:
                 raise UsageError(f"a component of unknown kind '{min(strange)}'; kinds are {', '.join(KINDS)}")
             components += declared
         except (Exception, SystemExit) as error:  # a third party's import may fail in any way; the program must not
-            broken.append(Broken(_owner(point), point.name, f"{type(error).__name__}: {error}"))
+            broken.append(Broken(owner, point.name, f"{type(error).__name__}: {error}"))
     return Registry(components, broken, manager)
 
 
