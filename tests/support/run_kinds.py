@@ -168,4 +168,4 @@ def made(kind: str, out: Path, rng: np.random.Generator | None = None) -> Path:
     if kind == "recording":
         write_log(out / "log.csv", rng or np.random.default_rng(1))
         found["recording"] = {**found["recording"], "files": [str(out / "log.csv")]}
-    return gc.run(found, out=out).folder
+    return gc.run(found, out=out, executor="threads").folder
