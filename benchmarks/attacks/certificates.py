@@ -53,17 +53,20 @@ def drawn(rng: np.random.Generator) -> dict[str, Any]:
     backend = {**model, "derivative": {"p": f"({plain} + {gap})/T", "v": "(u - 0.5*v)/T"}}
     constants = str(rng.choice(["interval", "interval", "piecewise", "wood-zhang"]))
     family = str(rng.choice(["constant", "envelope", "envelope", "multilinear", "basis", "neural"]))
+    bent = {}
+    if family == "multilinear":
+        constants, bent = constants.replace("piecewise", "gradient-elite"), {"curvature": True}
     fit = {"basis": {"functions": FUNCTIONS}, "neural": TRAINED}.get(family, {})
     routes = gc.registry().get("gap_family", family).load()(**fit).routes
     route, budget = str(rng.choice(routes)), int(rng.integers(40, 200))
     sampling: dict[str, Any] = {"kind": "lattice" if family == "multilinear" else "adaptive", "budget": budget}
     if route == "theorem1":
-        sampling = {"kind": "grid", "counts": rng.integers(3, 9, 3).tolist()}
+        sampling = {"kind": "grid", "counts": dict(zip("pvu", rng.integers(3, 9, 3).tolist(), strict=True))}
     claim = {"claim": "deterministic"} if constants == "interval" and rng.random() < 0.8 else AUDIT
     return {
         "version": 1, "name": "drawn", "model": model, "backend": backend, "seed": int(rng.integers(2**31)),
         "domain": {"p": [low, high], "v": [-1, 1], "u": [-1, 1]},
-        "sampling": sampling, "lipschitz": {"residual": {"kind": constants}}, "gap": {"kind": family, **fit},
+        "sampling": sampling, "lipschitz": {"residual": {"kind": constants, **bent}}, "gap": {"kind": family, **fit},
         "certificate": {**claim, "route": route},
     }  # fmt: skip
 
@@ -119,7 +122,8 @@ def attempt(rng: np.random.Generator, folder: Path, tries: int = POINTS) -> Atte
         run = gc.run(spec, overrides=("report.html=false", "report.rerun=false"), out=folder, executor="threads")
     except gc.GapcertError as error:
         return Attempt("refused", case={**made, "why": str(error).splitlines()[0][:300]})
-    certificate = run.certificate
+    if (certificate := run.certificate) is None:
+        return Attempt("refused", case={**made, "why": run.summary["reason"]})
     claim = certificate.claim.kind if certificate.holds else "refused"
     residual = Residual(run.artifacts["backend"], run.artifacts["model"])
     plain = certificate.domain.draw(tries // 2, rng)
