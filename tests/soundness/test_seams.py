@@ -109,7 +109,6 @@ def test_nobody_breaks_a_promise_at_a_seam(seed: int) -> None:
     assert broken == 0
 
 
-@pytest.mark.exam
 def test_most_of_these_games_are_won() -> None:
     """That the test above is about something."""
     won = [made(seed)[1].evidence["winning_cells"] > 0 for seed in range(10)]

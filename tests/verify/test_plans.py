@@ -129,7 +129,6 @@ def test_of_an_unknown_kind_the_promise_is_trusted_by_name(runs, tmp_path):
     assert any("somebody's" in t for t in verify_run(run)["trusted"])
 
 
-@pytest.mark.exam
 def test_what_is_left_out_is_bounded_where_nobody_looked(runs):
     """Random points of X × U: f + [l, u] less the line is within what the proof of the tube allows, and no bound is loose."""
     from gapcert_verify.controllers.saved import controlled
