@@ -1,4 +1,4 @@
-"""Inputs that are too weak: the ranges that would suffice, found by trying wider ones, and how they are told."""
+"""Inputs that are too weak: the ranges that would suffice, found by trying wider ones, and the words for them."""
 
 from __future__ import annotations
 

@@ -437,7 +437,7 @@ def copies(e: Evidence) -> str:
 
 
 NAMED = 3
-"""Copies that are told by name."""
+"""Copies that a certificate names: as many as `copies_told` of recordings has."""
 
 
 def _book(e: Evidence) -> Iterator[Said]:

@@ -1,4 +1,4 @@
-"""Trends in residuals: unchanged plants are accused as seldom as is said, whatever neighbours share, and drifts are found."""
+"""Trends in residuals: unchanged plants are accused as seldom as stated, whatever neighbours share, and drifts are found."""
 
 from __future__ import annotations
 

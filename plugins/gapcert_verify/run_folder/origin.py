@@ -280,7 +280,7 @@ def resolved(e: Evidence, o: Origin) -> str | None:
     own, (z, r) = e.arrays["resolution"], e.samples
     whole = own + predictor(e, o).resolution(o.domain)
     if not np.allclose(e.arrays["remainder.resolution"], whole, rtol=_SAME, atol=0.0):
-        return f"r − p is said to be known to {e.arrays['remainder.resolution'].tolist()}, and is to {whole.tolist()}"
+        return f"e of r − p is stated as {e.arrays['remainder.resolution'].tolist()}, and follows as {whole.tolist()}"
     if "recording" not in e.data:
         return ""
     size = np.abs(z[:, : o.model.nx]).max(axis=0) + np.abs(r).max(axis=0)
