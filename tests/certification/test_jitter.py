@@ -11,6 +11,7 @@ from impure import CONSTANTS, Circumstantial, domain, nominal
 
 import gapcert as gc
 from gapcert.certification.gates import entry
+from gapcert.contracts.systems.arithmetic import Arithmetic
 from gapcert_bounds.constants.declared_constants import Declared
 
 LOST = {
@@ -143,3 +144,28 @@ def test_a_smooth_engine_keeps_its_e(seed, tmp_path):
 
 def test_text_is_proved_and_not_measured():
     assert entry.jitter(nominal(), domain(), 0) is None
+
+
+class Arm(gc.Backend):
+    """Many joints, each pushed by a motor."""
+
+    def __init__(self, joints):
+        states = [gc.StateSpec(f"q{k}", "rad") for k in range(joints)] + [gc.StateSpec(f"w{k}", "rad/s") for k in range(joints)]
+        self.states, self.inputs = tuple(states), tuple(gc.StateSpec(f"m{k}", "N*m") for k in range(joints))
+        self.period = 0.01
+
+    def _step(self, x, u, **options):
+        q, w = np.split(x, 2, axis=1)
+        return np.hstack([q + 0.01 * w, w + 0.01 * (u - 9.81 * np.sin(q))])
+
+
+@pytest.mark.parametrize("joints", [3, 9])
+def test_what_an_engine_states_is_asked_at_the_ends_of_many_axes(joints):
+    arm = Arm(joints)
+    ranges = {s.name: (-1, 1) for s in arm.states} | {s.name: (-30, 30) for s in arm.inputs}
+    found = Arithmetic.of(arm, gc.Domain.of(arm, ranges))
+    # The largest speed after a step is 1 + 0.01 (30 + 9.81 sin 1) = 1.38, and every end of one axis is among the corners drawn.
+    largest = np.concatenate([np.full(joints, 1.01), np.full(joints, 1 + 0.01 * (30 + 9.81 * np.sin(1)))])
+    assert not found.proved
+    assert (arm.resolution(0.99 * largest) <= found.e).all()
+    assert (found.e <= arm.resolution(largest) * (1 + 1e-12)).all()

@@ -18,7 +18,7 @@ class Thresholds:
     symmetry_pairs: int = chosen(500, "of points at which a declared symmetry is held against the residual")
     # systems
     rounding_boxes: int = chosen(256, "over which arithmetic is followed, where fewer are too wide")
-    rounding_points: int = chosen(64, "corners of Z, and as many points in it, with which the boxes are compared")
+    rounding_points: int = chosen(256, "corners of Z at most, and points in it, with which the boxes are compared")
     rounding_wide: float = chosen(1024.0, "times the bound at points: above that, eight times as many boxes are tried")
     rounding_plain: float = chosen(16.0, "times 4 ulp of the state: a larger error is that of a term within, and names it")
     region_sweeps: int = chosen(40, "of coordinates, for the extreme of an ellipsoid over a box")

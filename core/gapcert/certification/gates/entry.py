@@ -17,6 +17,7 @@ from gapcert.certification.samples.store import Store
 from gapcert.certification.thresholds import THRESHOLDS
 from gapcert.contracts.gaps.lipschitz import Residual
 from gapcert.contracts.plugins.events import Emit, Event, Pulse
+from gapcert.contracts.systems.arithmetic import Arithmetic
 from gapcert.contracts.systems.domain import Domain, Points
 from gapcert.contracts.systems.system import Model, System, difference
 from gapcert.numerics.arrays import Array
@@ -72,12 +73,11 @@ def enter(
 
 
 def jitter(system: System, domain: Domain, seed: int) -> Array | None:
-    """(nx,): how far x⁺ is from the best parabola over z ± 1 to 10⁶ ulp, at most, at points of Z; None of text or rotations.
+    """(nx,): how far x⁺ is from the best parabola over z ± 1 to 10⁶ ulp, at most; None where e is proved, or of rotations.
 
     f̂ itself is one there, and |Σ w_k y_k| ≤ e Σ |w_k| for the weights w of the third divided difference of any four answers.
     """
-    text = isinstance(system, Model) and system.rounding_over(domain.interval) is not None
-    if text or "quaternion" in [s.kind for s in system.states]:
+    if Arithmetic.of(system, domain).proved or "quaternion" in [s.kind for s in system.states]:
         return None
     z = domain.draw(THRESHOLDS.repeat_rows, np.random.default_rng([seed, 0x177E]))
     step = np.spacing(np.abs(z)) * np.where(z < domain.centre, 1.0, -1.0)

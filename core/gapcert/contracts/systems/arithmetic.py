@@ -35,8 +35,8 @@ class Arithmetic:
 
     @classmethod
     def of(cls, system: System, domain: Domain) -> Arithmetic:
-        """By a Model's proof, where there is one; else what the System states at the largest |x⁺| on Z's corners and centre,
-        and for a Model no less than what is proved at points of Z.
+        """By a Model's proof, where there is one; else what the System states at the largest |x⁺| on corners of Z and points
+        in it, and for a Model no less than what is proved there.
         """
         own = ref(system), ref(domain)
         known = next((e for *asked, e in _KNOWN if asked[0] is own[0] and asked[1] is own[1]), None)
@@ -46,18 +46,23 @@ class Arithmetic:
 
     @classmethod
     def _of(cls, system: System, domain: Domain) -> Arithmetic:
-        if not isinstance(system, Model) or (bound := system.rounding_over(domain.interval)) is None:
-            return cls(system.resolution(_largest(system, domain)))
-        boxes, points = domain.interval, _points(domain)
-        if (bound > system.resolution(system.enclosure(boxes).mag[0]) / 2).any():
-            boxes, bound, least = _covered(system, domain, bound, points)
+        points = _points(domain)
+        text = system if isinstance(system, Model) else None
+        boxes = Interval.concatenate([domain.interval, Interval.exact(points)])
+        if text is None or (over := text.rounding_over(boxes)) is None:
+            return cls(system.resolution(_size(system, points)))
+        boxes, bound, least = domain.interval, over[:1], over[1:].max(axis=0)
+        size = text.enclosure(boxes).mag
+        if (bound > text.resolution(size[0]) / 2).any():
+            boxes, bound = _covered(text, domain, bound, least)
             if not np.isfinite(bound).all():
-                stated = system.resolution(_largest(system, domain))
+                stated = text.resolution(_size(text, points))
                 return cls(np.maximum(stated, np.where(np.isfinite(least), 2 * least, 0.0)))
+            size = text.enclosure(boxes).mag if len(boxes) > 1 else size
         # f̂ − f, whole turns of it, and r − p round in turn, by u = eps / 2 of |f̂| + |f| or of that and a few turns.
-        e = bound.max(axis=0) + 2 * np.finfo(float).eps * system.enclosure(boxes).mag.max(axis=0)
-        plain = e <= THRESHOLDS.rounding_plain * system.resolution(_size(system, points))
-        worst = ("",) * len(e) if plain.all() else system.rounding_terms(boxes[(bound / e).max(axis=1).argmax()][None])
+        e = bound.max(axis=0) + 2 * np.finfo(float).eps * size.max(axis=0)
+        plain = e <= THRESHOLDS.rounding_plain * text.resolution(_size(text, points))
+        worst = ("",) * len(e) if plain.all() else text.rounding_terms(boxes[(bound / e).max(axis=1).argmax()][None])
         return cls(e, True, tuple("" if small else term for small, term in zip(plain, worst, strict=True)))
 
     def covering(self, jitter: Array | None) -> Arithmetic:
@@ -96,29 +101,22 @@ def named(backend: Arithmetic, model: Arithmetic, names: Sequence[str]) -> list[
     ]
 
 
-def _largest(system: System, domain: Domain) -> Array:
-    """Max |x⁺| (nx,) on Z's corners and centre. Where relations cut a corner off, the last point of Z on the way stands in."""
-    corners = np.stack(np.meshgrid(*zip(domain.low, (domain.low + domain.high) / 2, domain.high, strict=True)), axis=-1)
-    return _size(system, domain.reach(domain.centre, corners.reshape(-1, len(domain.low))))
-
-
 def _size(system: System, z: Array) -> Array:
     return np.asarray(np.abs(system.step(z[:, : system.nx], z[:, system.nx :]).x).max(axis=0))
 
 
-def _covered(model: Model, domain: Domain, bound: Array, points: Array) -> tuple[Interval, Array, Array]:
-    """(boxes that cover Z, bounds over each (n, nx), the largest of those at points of Z (nx,)), from `bound` over Z's box.
+def _covered(model: Model, domain: Domain, bound: Array, least: Array) -> tuple[Interval, Array]:
+    """(boxes that cover Z, bounds over each (n, nx)), from `bound` over Z's box and the largest at points of Z, `least` (nx,).
 
     Boxes are cut across their widest axis while a bound is well above those at points.
     """
     boxes, width = domain.interval, np.maximum(domain.width, np.finfo(float).tiny)
-    least = np.asarray(model.rounding_over(Interval.exact(points))).max(axis=0)
     while True:
         over = (bound / np.maximum(least, np.finfo(float).tiny)).max(axis=1)
         most = THRESHOLDS.rounding_boxes * (1 if over.max() < THRESHOLDS.rounding_wide else 8)
         urgent = np.flatnonzero(~(over <= 2))[: max(0, most - len(boxes))]
         if not len(urgent):
-            return boxes, bound, least
+            return boxes, bound
         parts = boxes[urgent].cut(((boxes.hi - boxes.lo)[urgent] / width).argmax(axis=1))
         parts = parts[~domain.outside(parts)]
         kept, finer = np.delete(np.arange(len(boxes)), urgent), np.asarray(model.rounding_over(parts))
@@ -126,7 +124,8 @@ def _covered(model: Model, domain: Domain, bound: Array, points: Array) -> tuple
 
 
 def _points(domain: Domain) -> Array:
-    """Corners of Z, or what relations leave of the way there, and points inside."""
-    rng, n = np.random.default_rng(0), THRESHOLDS.rounding_points
-    ends = np.where(rng.random((n, len(domain.low))) < 0.5, domain.low, domain.high)
-    return np.concatenate([domain.reach(domain.centre, ends), domain.draw(n, rng)])
+    """Corners of Z, drawn where there are many, or what relations leave of the way there; its centre, and points inside."""
+    rng, n, nz = np.random.default_rng(0), THRESHOLDS.rounding_points, len(domain.low)
+    sides = np.indices((2,) * nz).reshape(nz, -1).T if 2**nz <= n else rng.integers(2, size=(n, nz))
+    ends = domain.reach(domain.centre, np.where(sides, domain.high, domain.low))
+    return np.concatenate([domain.centre[None], ends, domain.draw(n, rng)])
