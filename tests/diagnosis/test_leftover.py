@@ -20,6 +20,7 @@ from gapcert_diagnosis.residual.regression import features
 from gapcert_diagnosis.residual.unexplained import evidence
 from gapcert_diagnosis.search.candidates import Library
 from gapcert_diagnosis.testing import ROD, equations
+from gapcert_report.words.diagnosis import dependence
 
 PERIOD = 0.01
 SWING = {**ROD, "parameters": {**ROD["parameters"], "m": {"value": "1 kg", "tolerance": "2 %"}}}
@@ -325,3 +326,16 @@ def test_gusts_all_over_are_no_pushes():
         forces[0, 5 * k : 5 * k + 25] = rng.standard_t(2) * 0.5
     found = find(recorded(truth(), forces=forces, noise=1e-3))
     assert (found.verdict, found.unexplained.needs_memory, found.unexplained.events) == ("unexplained", False, ())
+
+
+@pytest.mark.parametrize("switched", [0.0, 0.4])
+def test_a_force_of_time_alone_is_told_as_one_from_outside(switched):
+    t = np.arange((len(U) - 1) * 5) * PERIOD / 5
+    force = 0.7 * np.sin(2 * np.pi * (0.3 * t + 0.07 * t**2)) * (1 + switched * np.sign(np.sin(1.3 * t)))
+    found = find(recorded(truth(), forces=force[None, :, None, None], noise=1e-3))
+    rest = found.summary()["unexplained"]
+    assert (found.verdict, found.causes, rest["needs_memory"]) == ("unexplained", (), False)
+    assert set(rest["looks_like"].values()) == {0.0}
+    assert dependence(rest).startswith(
+        "No dependence on state, input or their past was found; it looks like an external disturbance, "
+    )
