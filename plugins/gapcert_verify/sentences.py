@@ -230,7 +230,7 @@ def _within(both: Sequence[Mapping[str, Any]]) -> str:
 def _known(a: Mapping[str, Any]) -> str:
     if "jitter" in a:
         return (
-            f"is measured, not proved: it covers twice what close answers leave a parabola by, {max(a['jitter']):.2g} at most"
+            f"is measured, not proved: it covers four times what close answers leave a parabola by, {max(a['jitter']):.2g} at most"
         )
     return "is proved by a running error analysis of the equations" if a["proved"] else "is assumed as it is stated, not proved"
 
@@ -240,7 +240,7 @@ def _terms(e: Evidence, both: Sequence[Mapping[str, Any]]) -> str:
     systems = zip(("f̂", "f"), both, strict=True)
     each = ((n, term, of) for of, a in systems for n, term in zip(states(e), a["terms"], strict=False) if term)
     seen = zip(states(e), both[0]["e"], both[0].get("jitter", ()), strict=False)
-    told = [f" e({n}) of f̂ is twice its jitter, which is more than is stated." for n, own, j in seen if own == 2 * j > 0]
+    told = [f" e({n}) of f̂ is four times its jitter, which is more than is stated." for n, own, j in seen if own == 4 * j > 0]
     return "".join([*told, *(f" Most of e({n}) is the rounding of {term} in {of}." for n, term, of in each)])
 
 

@@ -23,9 +23,8 @@ from gapcert.contracts.systems.system import Model, System, difference
 from gapcert.numerics.arrays import Array
 from gapcert.numerics.errors import UsageError
 
-_ULPS = np.sort([0.0, *np.outer([-1.0, 1.0], [1.0, 4.0, 16.0, 64.0, 400.0, 1e4, 1e6]).ravel()])
-_FOURS = np.array([*itertools.combinations(range(len(_ULPS)), 4)])
-_DIVIDED = 1 / (_ULPS[_FOURS][:, :, None] - _ULPS[_FOURS][:, None] + np.eye(4)).prod(axis=2)
+_ULPS = np.array([-1e6, -400.0, -64.0, -4.0, -1.0, 0.0, 1.0, 4.0, 64.0, 400.0, 1e6])
+_WIDE = np.array([-10.0, -7.0, -5.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 5.0, 7.0, 10.0])
 
 
 def contain(model: Model, domain: Domain) -> None:
@@ -73,19 +72,41 @@ def enter(
 
 
 def jitter(system: System, domain: Domain, seed: int) -> Array | None:
-    """(nx,): how far x⁺ is from the best parabola over z ± 1 to 10⁶ ulp, at most; None where e is proved, or of rotations.
+    """(nx,): how far x⁺ is from the best parabola in z, at most, at points of Z; None where e is proved, or of rotations.
 
-    f̂ itself is one there, and |Σ w_k y_k| ≤ e Σ |w_k| for the weights w of the third divided difference of any four answers.
+    Over 1 to 10⁶ ulp, where f̂ itself is one; and over 2e-7 of Z or of z, since single precision takes steps that long. A bend
+    leaves 1/37 as much over three tenths of that way, and does not count.
     """
     if Arithmetic.of(system, domain).proved or "quaternion" in [s.kind for s in system.states]:
         return None
     z = domain.draw(THRESHOLDS.repeat_rows, np.random.default_rng([seed, 0x177E]))
-    step = np.spacing(np.abs(z)) * np.where(z < domain.centre, 1.0, -1.0)
-    near = (z[:, None] + _ULPS[:, None] * step[:, None]).reshape(-1, z.shape[1])
-    x = system.step(*map(np.ascontiguousarray, domain.split(near))).x
-    y = difference(system.states, x, x[:: len(_ULPS)].repeat(len(_ULPS), axis=0)).reshape(len(z), len(_ULPS), -1)
-    off = np.abs((y[:, _FOURS] * _DIVIDED[..., None]).sum(axis=2)) / np.abs(_DIVIDED).sum(axis=1)[:, None]
-    return np.asarray(off.max(axis=(0, 1)))
+    ulp = np.spacing(np.abs(z))
+    most = np.minimum(2e-7 * np.maximum(np.abs(z), domain.width), 0.001 * domain.width)
+    # Powers of two, so that floats are where they are said to be.
+    wide = np.maximum(2.0 ** np.floor(np.log2(most / _WIDE[-1])), ulp)
+
+    def answers(t: Array, step: Array, z: Array) -> Array:
+        near = (z[:, None] + t[:, None] * (step * np.where(z < domain.centre, 1.0, -1.0))[:, None]).reshape(-1, z.shape[1])
+        x = system.step(*map(np.ascontiguousarray, domain.split(near))).x
+        return difference(system.states, x, x[:: len(t)].repeat(len(t), axis=0)).reshape(len(z), len(t), -1)
+
+    far = answers(_WIDE, wide[::2], z[::2])
+    inner, outer = (_unlike_parabola(_WIDE[at], far[:, at]) for at in (np.abs(_WIDE) <= 3, (np.abs(_WIDE) >= 3) | (_WIDE == 0)))
+    bends = (inner > outer / 80) & (inner < outer / 10)
+    # Where most points bend, others are inflections.
+    most = np.where(bends.mean(axis=0) > 0.5, np.where(bends, outer, 0.0).max(axis=0), 0.0)
+    seen = [_unlike_parabola(_ULPS, answers(_ULPS, ulp, z)), np.where(bends | (outer < most), 0.0, outer)]
+    return np.asarray(np.concatenate(seen).max(axis=0))
+
+
+def _unlike_parabola(t: Array, y: Array) -> Array:
+    """(n, nx), of y (n, len(t), nx): errors within e leave |Σ w_k y_k| ≤ e Σ |w_k|, w the weights of the third divided
+    difference of any four.
+    """
+    fours = np.array([*itertools.combinations(range(len(t)), 4)])
+    w = 1 / (t[fours][:, :, None] - t[fours][:, None] + np.eye(4)).prod(axis=2)
+    off = np.abs((y[:, fours] * w[..., None]).sum(axis=2)) / np.abs(w).sum(axis=1)[:, None]
+    return np.asarray(off.max(axis=1))
 
 
 def responses(residual: Residual, domain: Domain, seed: int) -> list[str]:

@@ -25,7 +25,7 @@ class Arithmetic:
     """e (nx,) of one System on Z, see `Model.rounding_over`; `proved`, or an assumption.
 
     terms: per state the term whose rounding has the largest share, empty where e is as small as the state's own last digits.
-    jitter (nx,): of an engine, by how much answers a few ulp apart left a parabola; e covers twice that.
+    jitter (nx,): of an engine, by how much close answers left a parabola; e covers four times that.
     """
 
     e: Array
@@ -66,8 +66,8 @@ class Arithmetic:
         return cls(e, True, tuple("" if small else term for small, term in zip(plain, worst, strict=True)))
 
     def covering(self, jitter: Array | None) -> Arithmetic:
-        """With e no less than twice what was seen at some points of Z."""
-        return self if jitter is None else replace(self, e=np.maximum(self.e, 2 * jitter), jitter=jitter)
+        """With e no less than four times what was seen at some points of Z."""
+        return self if jitter is None else replace(self, e=np.maximum(self.e, 4 * jitter), jitter=jitter)
 
     def to_data(self) -> dict[str, Any]:
         """JSON-able."""
@@ -86,14 +86,14 @@ def sentence(backend: Arithmetic, model: Arithmetic, names: Sequence[str]) -> st
 
 def _known(a: Arithmetic) -> str:
     if a.jitter is not None:
-        return f"is measured, not proved: it covers twice what close answers leave a parabola by, {a.jitter.max():.2g} at most"
+        return f"is measured, not proved: it covers four times what close answers leave a parabola by, {a.jitter.max():.2g} at most"
     return "is proved by a running error analysis of the equations" if a.proved else "is assumed as it is stated, not proved"
 
 
 def named(backend: Arithmetic, model: Arithmetic, names: Sequence[str]) -> list[str]:
     """Terms with which text cancels badly, and states of f̂ that jitter by more than is stated."""
     seen = zip(names, backend.e, () if backend.jitter is None else backend.jitter, strict=False)
-    return [f"e({n}) of f̂ is twice its jitter, which is more than is stated." for n, e, j in seen if e == 2 * j > 0] + [
+    return [f"e({n}) of f̂ is four times its jitter, which is more than is stated." for n, e, j in seen if e == 4 * j > 0] + [
         f"Most of e({n}) is the rounding of {term} in {of}."
         for of, a in (("f̂", backend), ("f", model))
         for n, term in zip(names, a.terms, strict=False)
