@@ -127,7 +127,7 @@ class Fingerprint:
 
     def _answers(self, z: Array) -> Array:
         """(3, n, nx): f, f̂ (of its draws the mean), and the deviation of f̂'s draws, at points z (n, nz)."""
-        x, u = (np.ascontiguousarray(part) for part in self.domain.split(z / self._unit))
+        x, u = self.domain.split(z / self._unit)
         seeds = range(THRESHOLDS.question_draws) if "seed" in self.backend.capabilities else (None,)
         drawn = np.stack([self.backend.step(x, u, seed=seed).x for seed in seeds])
         apart = difference(self.model.states, drawn, np.broadcast_to(drawn[:1], drawn.shape))

@@ -17,8 +17,7 @@ def repeating(model: Model, backend: System, domain: Domain, seed: int) -> tuple
 
     UsageError where f or f̂ does not repeat with it.
     """
-    z = domain.draw(THRESHOLDS.repeat_rows, np.random.default_rng([seed, 0xC19C]))
-    x, u = (np.ascontiguousarray(part) for part in domain.split(z))
+    x, u = domain.split(domain.draw(THRESHOLDS.repeat_rows, np.random.default_rng([seed, 0xC19C])))
     said, apart = [], np.abs(backend.step(x, u).x - model.step(x, u).x).max(axis=0)
     for j, axis in enumerate(domain.states.axes):
         if axis.kind == "angle" and (domain.states.wraps[j] or apart[j] > TURN / 2):

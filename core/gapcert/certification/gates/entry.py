@@ -24,7 +24,7 @@ from gapcert.numerics.arrays import Array
 from gapcert.numerics.errors import UsageError
 
 _ULPS = np.array([-1e6, -400.0, -64.0, -4.0, -1.0, 0.0, 1.0, 4.0, 64.0, 400.0, 1e6])
-_WIDE = np.array([-10.0, -7.0, -5.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 5.0, 7.0, 10.0])
+_EVEN = np.array([-10.0, -7.0, -5.0, -3.0, 0.0, 3.0, 5.0, 7.0, 10.0])
 
 
 def contain(model: Model, domain: Domain) -> None:
@@ -75,38 +75,35 @@ def jitter(system: System, domain: Domain, seed: int) -> Array | None:
     """(nx,): how far x⁺ is from the best parabola in z, at most, at points of Z; None where e is proved, or of rotations.
 
     Over 1 to 10⁶ ulp, where f̂ itself is one; and over 2e-7 of Z or of z, since single precision takes steps that long. A bend
-    leaves 1/37 as much over three tenths of that way, and does not count.
+    leaves 1/64 as much over a quarter of that way, and does not count.
     """
     if Arithmetic.of(system, domain).proved or "quaternion" in [s.kind for s in system.states]:
         return None
     z = domain.draw(THRESHOLDS.repeat_rows, np.random.default_rng([seed, 0x177E]))
-    ulp = np.spacing(np.abs(z))
-    most = np.minimum(2e-7 * np.maximum(np.abs(z), domain.width), 0.001 * domain.width)
+    ulp, inwards = np.spacing(np.abs(z)), np.where(z < domain.centre, 1.0, -1.0)
+    wide = np.minimum(2e-7 * np.maximum(np.abs(z), domain.width), 0.001 * domain.width) / _EVEN[-1]
     # Powers of two, so that floats are where they are said to be.
-    wide = np.maximum(2.0 ** np.floor(np.log2(most / _WIDE[-1])), ulp)
-
-    def answers(t: Array, step: Array, z: Array) -> Array:
-        near = (z[:, None] + t[:, None] * (step * np.where(z < domain.centre, 1.0, -1.0))[:, None]).reshape(-1, z.shape[1])
-        x = system.step(*map(np.ascontiguousarray, domain.split(near))).x
-        return difference(system.states, x, x[:: len(t)].repeat(len(t), axis=0)).reshape(len(z), len(t), -1)
-
-    far = answers(_WIDE, wide[::2], z[::2])
-    inner, outer = (_unlike_parabola(_WIDE[at], far[:, at]) for at in (np.abs(_WIDE) <= 3, (np.abs(_WIDE) >= 3) | (_WIDE == 0)))
-    bends = (inner > outer / 80) & (inner < outer / 10)
+    wide = np.maximum(2.0 ** np.floor(np.log2(wide)), 4 * ulp)[::2] * inwards[::2]
+    fine, outer, inner = (
+        _unlike_parabola(system, domain, *given)
+        for given in ((z, _ULPS, ulp * inwards), (z[::2], _EVEN, wide), (z[::2], _EVEN, wide / 4))
+    )
+    bends = (inner > outer / 160) & (inner < outer / 16)
     # Where most points bend, others are inflections.
     most = np.where(bends.mean(axis=0) > 0.5, np.where(bends, outer, 0.0).max(axis=0), 0.0)
-    seen = [_unlike_parabola(_ULPS, answers(_ULPS, ulp, z)), np.where(bends | (outer < most), 0.0, outer)]
-    return np.asarray(np.concatenate(seen).max(axis=0))
+    return np.asarray(np.concatenate([fine, np.where(bends | (outer < most), 0.0, outer)]).max(axis=0))
 
 
-def _unlike_parabola(t: Array, y: Array) -> Array:
-    """(n, nx), of y (n, len(t), nx): errors within e leave |Σ w_k y_k| ≤ e Σ |w_k|, w the weights of the third divided
-    difference of any four.
+def _unlike_parabola(system: System, domain: Domain, z: Array, t: Array, step: Array) -> Array:
+    """(n, nx), at z + t · step: errors within e leave |Σ w_k y_k| ≤ e Σ |w_k|, w the weights of the third divided difference of
+    any four answers y.
     """
+    near = (z[:, None] + t[:, None] * step[:, None]).reshape(-1, z.shape[1])
+    x = system.step(*domain.split(near)).x
+    y = difference(system.states, x, x[:: len(t)].repeat(len(t), axis=0)).reshape(len(z), len(t), -1)
     fours = np.array([*itertools.combinations(range(len(t)), 4)])
     w = 1 / (t[fours][:, :, None] - t[fours][:, None] + np.eye(4)).prod(axis=2)
-    off = np.abs((y[:, fours] * w[..., None]).sum(axis=2)) / np.abs(w).sum(axis=1)[:, None]
-    return np.asarray(off.max(axis=1))
+    return np.asarray((np.abs((y[:, fours] * w[..., None]).sum(axis=2)) / np.abs(w).sum(axis=1)[:, None]).max(axis=1))
 
 
 def responses(residual: Residual, domain: Domain, seed: int) -> list[str]:
@@ -121,13 +118,9 @@ def responses(residual: Residual, domain: Domain, seed: int) -> list[str]:
     if not domain.relations:
         z[:, domain.nx :] = (domain.low + domain.high)[domain.nx :] / 2
     resolution = residual.resolution(domain)
-    for j, spec in enumerate(model.inputs):
-        ends = []
-        for bound in domain.chord(z, domain.nx + j):
-            at = z.copy()
-            at[:, domain.nx + j] = bound
-            x, u = (np.ascontiguousarray(part) for part in domain.split(at))
-            ends.append([s.step(x, u).x for s in (residual.backend, model)])
+    for j, spec in enumerate(model.inputs, domain.nx):
+        at = [domain.split(np.where(np.arange(z.shape[1]) == j, b[:, None], z)) for b in domain.chord(z, j)]
+        ends = [[s.step(*end).x for s in (residual.backend, model)] for end in at]
         there, here = (difference(model.states, high, low) for low, high in zip(*ends, strict=True))
         for i, state in enumerate(model.states):
             # What f does not move within one step beyond rounding has no ratio.

@@ -89,7 +89,7 @@ def visited(
     hands its hidden state on, so that what adds up over all steps does.
     """
     rng = np.random.default_rng([seed, 0x41DD])
-    x, u = (np.ascontiguousarray(part) for part in domain.split(domain.draw(runs, rng)))
+    x, u = domain.split(domain.draw(runs, rng))
     hidden, age, hold = default(system, runs), np.zeros(runs, dtype=int), 2 ** (np.arange(runs) % 8)
     xs, hs = [], []
     for k in range(steps):

@@ -227,10 +227,9 @@ def probe(residual: Residual, domain: Domain, ranges: Mapping[str, Range], pool:
     backend, rng = residual.backend, np.random.default_rng([seed, 0x41DE])
     names = tuple(s.name for s in backend.hidden)
     rows = max(4, min(24, THRESHOLDS.hidden_queries // len(names)))
-    z = domain.draw(THRESHOLDS.hidden_together, rng)
-    x, u = (np.ascontiguousarray(part) for part in domain.split(z))
+    x, u = domain.split(domain.draw(THRESHOLDS.hidden_together, rng))
     groups = [(x[:rows], u[:rows], moved(backend, rows, rng, ranges, (n,))) for n in names]
-    groups += [(x, u, moved(backend, len(x), rng, ranges)), _met(domain, pool, rng)]
+    groups += [(x, u, moved(backend, len(x), rng, ranges)), _met(domain, pool, rng, THRESHOLDS.hidden_together)]
     at = [np.concatenate(parts) for parts in zip(*groups, strict=True)]
     plain, other = backend.step(at[0], at[1]).x, backend.step(at[0], at[1], hidden=at[2]).x
     if (lost := ~np.isfinite(other).all(axis=1)).any():
@@ -246,14 +245,11 @@ def probe(residual: Residual, domain: Domain, ranges: Mapping[str, Range], pool:
     largest = np.array([p.max(axis=0) if len(p) else np.zeros(d.shape[1]) for p in parts])
     k = int(np.argmax((d / np.maximum(gap, e)).max(axis=1)))
     witness = {"x": at[0][k], "u": at[1][k], "hidden": at[2][k], "default": plain[k], "moved": other[k]}
-    lists = {key: value.tolist() for key, value in witness.items()}
     spent = 2 * len(d) + THRESHOLDS.hidden_runs * THRESHOLDS.hidden_steps
-    return Probe(names, largest[:-2], largest[-2], largest[-1], gap, e, lists, spent)
+    return Probe(names, largest[:-2], largest[-2], largest[-1], gap, e, {n: v.tolist() for n, v in witness.items()}, spent)
 
 
-def _met(
-    domain: Domain, pool: Pool, rng: np.random.Generator, most: int = THRESHOLDS.hidden_together
-) -> tuple[Array, Array, Array]:
+def _met(domain: Domain, pool: Pool, rng: np.random.Generator, most: int) -> tuple[Array, Array, Array]:
     """(x, u, h) of up to `most` visited states, each with a new input."""
     pick = rng.permutation(len(pool))[:most]
     u, inside = inputs(domain, pool.x[pick], rng)
@@ -262,8 +258,7 @@ def _met(
 
 def spread(draws: HiddenDraws, domain: Domain, seed: int) -> Array:
     """s (nx,): half the largest difference between two draws at one (x, u), over 64 points and 16 or so draws at each."""
-    z = domain.draw(THRESHOLDS.spread_points, np.random.default_rng([seed, 0x59D]))
-    x, u = (np.ascontiguousarray(p) for p in domain.split(z))
+    x, u = domain.split(domain.draw(THRESHOLDS.spread_points, np.random.default_rng([seed, 0x59D])))
     hs = draws.law.extremes(x, THRESHOLDS.spread_draws)
     after = draws.system.step(np.tile(x, (len(hs), 1)), np.tile(u, (len(hs), 1)), hidden=np.vstack(hs)).x
     after = after.reshape(len(hs), len(x), -1)
@@ -285,7 +280,7 @@ def attacked(
         return gate
     backend, domain, entry, n = gate.system, problem.domain, enter(), THRESHOLDS.hidden_attack
     rng = entry.draws(problem.seed, "hidden state")
-    x, u = (np.ascontiguousarray(part) for part in domain.split(domain.draw(n, rng)))
+    x, u = domain.split(domain.draw(n, rng))
     pulse = Pulse(emit, "attack", THRESHOLDS.hidden_steps + -(-2 * n // _BLOCK), "steps", "from other hidden states")
     met = visited(backend, domain, n // 8, THRESHOLDS.hidden_steps, int(rng.integers(2**32)), pulse)
     parts = [(x, u, moved(backend, n, rng, gate.plan.ranges)), _met(domain, met, rng, n)]
@@ -297,8 +292,7 @@ def attacked(
         after.append(backend.step(x[block], u[block], hidden=h[block]).x)
     r = difference(model.states, np.concatenate(after), model.step(x, u).x)
     above = (np.abs(r) > gamma).any(axis=1)
-    counts = {"points": len(x), "violations": int(above.sum()), "share": float(above.mean())}
-    out: dict[str, Any] = counts | entry.summary()
+    out: dict[str, Any] = {"points": len(x), "violations": int(above.sum()), "share": float(above.mean()), **entry.summary()}
     if above.any():
         k, i = np.unravel_index(int(np.argmax(np.abs(r) / np.maximum(gamma, np.finfo(float).tiny))), r.shape)
         witness = {"z": [*x[k].tolist(), *u[k].tolist()], "hidden": h[k].tolist(), "state": gate.states[i]}
@@ -322,8 +316,7 @@ def _by(states: Sequence[str], values: Array, gap: Array) -> str:
 def _refusal(p: Probe, augmenting: bool, states: Sequence[str], backend: System) -> str:
     """What was found, two hidden states with two different x⁺ under one (x, u), and which settings would solve it."""
     names = [n for n, _ in p.ranked()] or list(p.names)
-    w = p.witness
-    parts = [_spreads(p, states)]
+    w, parts = p.witness, [_spreads(p, states)]
     for how, values in (("all together", p.together), ("as visited in rollouts", p.met)):
         parts.append(f"{how} they move {_by(states, values, p.gap)}" if (values > THRESHOLDS.harmless * p.e).any() else "")
     found = "; ".join(filter(None, parts))

@@ -41,8 +41,7 @@ class Queries:
 def queries(system: System, domain: Domain, seed: int) -> Queries:
     """Random rows of Z, its centre, and ladders in it; hidden states are moved too: purity is about all arguments."""
     rng = np.random.default_rng([seed, 0x9075])
-    z = np.vstack([domain.draw(THRESHOLDS.purity_rows, rng), domain.centre])
-    x, u = (np.ascontiguousarray(part) for part in domain.split(z))
+    x, u = domain.split(np.vstack([domain.draw(THRESHOLDS.purity_rows, rng), domain.centre]))
     rows = laddered(system, Queries(x, u, moved(system, len(x), rng) if system.hidden else None))
     return rows[domain.zone.related(np.hstack([rows.x, rows.u]))]
 
@@ -91,16 +90,12 @@ def purity(
         if len(answer.x) >= THRESHOLDS.purity_rows:
             tell(what)
     # Company may change last bits, within e, as where loops are vectorised; the same call has the same bits at any time.
-    for what, asked in (
-        ("asked again in the same call", system),
-        ("asked of a fresh copy", pickle.loads(pickle.dumps(system))),
-    ):
+    fresh = pickle.loads(pickle.dumps(system))
+    for what, asked in (("asked again in the same call", system), ("asked of a fresh copy", fresh)):
         _same(role, system, rows, first, slice(None), apart(asked, rows, seed), what, exact=True)
         tell(what)
-    said, there = (
-        "repeated and permuted queries, close neighbours, other sizes of call",
-        _elsewhere(system, rows, executor, seed),
-    )
+    said = "repeated and permuted queries, close neighbours, other sizes of call"
+    there = _elsewhere(system, rows, executor, seed)
     if isinstance(there, str):
         return f"{said} and a fresh copy {agreed(d)} ({there})"
     for k, (index, answer) in enumerate(there):

@@ -86,7 +86,8 @@ def sentence(backend: Arithmetic, model: Arithmetic, names: Sequence[str]) -> st
 
 def _known(a: Arithmetic) -> str:
     if a.jitter is not None:
-        return f"is measured, not proved: it covers four times what close answers leave a parabola by, {a.jitter.max():.2g} at most"
+        by = f"close answers leave a parabola by, {a.jitter.max():.2g} at most"
+        return f"is measured, not proved: it covers four times what {by}"
     return "is proved by a running error analysis of the equations" if a.proved else "is assumed as it is stated, not proved"
 
 

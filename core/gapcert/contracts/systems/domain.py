@@ -184,8 +184,8 @@ class Domain:
         return len(self.states.axes)
 
     def split(self, z: Array) -> tuple[Array, Array]:
-        """(x, u) of points z."""
-        return z[..., : self.nx], z[..., self.nx :]
+        """(x, u) of points z, contiguous."""
+        return np.ascontiguousarray(z[..., : self.nx]), np.ascontiguousarray(z[..., self.nx :])
 
     def contains(self, z: Array) -> Bools:
         """(n,) booleans: in the box, and every relation holds; on the circle along axes that close on themselves."""
