@@ -48,8 +48,11 @@ def method(e: Evidence) -> str:
     pattern, provenance = METHODS.get(name, (re.escape(name), made))
     if not re.fullmatch(pattern, stated) or made != provenance:
         return f"'{stated}' is no method that gives {made} constants"
-    cells = re.search(r"(\d+) cells", stated)
-    return "the method names another number of cells" if cells and int(cells[1]) != e.data["lipschitz"].get("cells") else ""
+    cells, jump = (re.search(rf"(\d+) {what}", stated) for what in ("cells", "jump"))
+    if cells and int(cells[1]) != e.data["lipschitz"].get("cells"):
+        return "the method names another number of cells"
+    same = jump is None or int(jump[1]) == int((e.arrays["cells.J"] > 0).any(axis=1).sum())
+    return "" if same else "the method names another number of cells that jump"
 
 
 METHODS: Mapping[str, tuple[str, str]] = {
@@ -229,9 +232,8 @@ def _within(both: Sequence[Mapping[str, Any]]) -> str:
 
 def _known(a: Mapping[str, Any]) -> str:
     if "jitter" in a:
-        return (
-            f"is measured, not proved: it covers four times what close answers leave a parabola by, {max(a['jitter']):.2g} at most"
-        )
+        by = f"close answers leave a parabola by, {max(a['jitter']):.2g} at most"
+        return f"is measured, not proved: it covers four times what {by}"
     return "is proved by a running error analysis of the equations" if a["proved"] else "is assumed as it is stated, not proved"
 
 

@@ -26,6 +26,7 @@ from .controllers.saved import controlled
 from .evidence import Evidence, Part, another, bounds, distance, load, predictor
 from .margin import margin
 from .proofs import bent, dominates, exceeds, follows
+from .run_folder.fields import fields
 from .run_folder.origin import CHECKS as ORIGIN
 from .run_folder.origin import Check, Origin, arithmetic, gates, origin, shifted
 from .run_folder.origin import again as again_of
@@ -100,6 +101,7 @@ def verify_run(folder: Path | str, emit: Emit = silent, *, allow_code: bool = Fa
     checks += [
         ("the folder of a run is whole", whole_run),
         ("files match the root digest", root),
+        ("the folder's files have no fields of others", fields),
         ("the spec is the one that was run", partial(_specified, source)),
         *((name, partial(_asked, check, source)) for name, check in (*ORIGIN, *FOLDER)),
     ]
@@ -134,7 +136,7 @@ def _bare(e: Evidence) -> bool:
 
 def _stated(e: Evidence) -> str:
     gamma, names = e.arrays["gap.gamma"], sentences.states(e)
-    made = {"claim": {"kind": "assumed"}, "form": {"form": "constant"}, "vacuous": False}
+    made = {"claim": {"kind": "assumed"}, "form": {"form": "constant"}, "predictor": "none", "vacuous": False}
     made["states"] = {n: {"gamma_max": g} for n, g in zip(names, gamma.tolist(), strict=True)}
     if other := next((k for k, v in made.items() if e.data.get(k) != v), ""):
         return f"{other} is stated as {e.data.get(other)}, and of a declared γ it is {made[other]}"
@@ -145,7 +147,7 @@ def _trusted(e: Evidence, source: Origin | str | UsageError) -> list[str]:
     """What the verdict rests on beside the checks."""
     told: list[tuple[str, Any]] = [
         (f"Model, domain, names and what was asked are as stated: {source}.", not isinstance(source, Origin)),
-        ("Versions, times, and budgets of the spec that only a new run could tell are as stated.", True),
+        ("Versions, times, and seed and budgets of the spec that only a new run could tell are as stated.", True),
         ("It is of before format 2: its sentences, e, hidden state, answer, pictures and page are as stated.", e.older),
     ]
     whole = isinstance(source, Origin) and source.text
@@ -156,6 +158,7 @@ def _trusted(e: Evidence, source: Origin | str | UsageError) -> list[str]:
         told += [
             (f"The stored transitions are {_RECORDED}.", True),
             ("Which rows of the recording are copies of others is as stated.", sentences.copies(e)),
+            (f"The number of the calibration is {_BOOKED}", "book" in e.data["recording"]),
             (f"The windows, and the one that the claim is about, are {alike}, chosen before anyone looked at these.", True),
         ]
         return [text for text, so in told if so]
@@ -168,7 +171,7 @@ def _trusted(e: Evidence, source: Origin | str | UsageError) -> list[str]:
     told += [
         (f"{_ONLY}, hidden state, purity and attacks, is as stated: {why}.", not whole),
         ("How f̂ answered when it was asked again is as stated.", whole and not e.data.get("calibration", {}).get("noise")),
-        ("The number of the audit is what the book beside the run folders counted; the book was not looked at.", True),
+        (f"The number of the audit is {_BOOKED}", True),
         (
             "The audit's points were drawn by the rule before the book's format 2, of seed and number: a fit could know them.",
             "book" not in e.data["audit"],
@@ -197,6 +200,7 @@ def _trusted(e: Evidence, source: Origin | str | UsageError) -> list[str]:
 
 _ONLY = "What only f̂ can tell, that residuals are those of it and of f"
 _RECORDED = "all of the recording's that begin in Z, measured when they are drawn to be, and their residuals are those of f"
+_BOOKED = "what the book beside the run folders counted; the book was not looked at."
 _NOBODY = "γ is what a person declares. No simulator was asked."
 
 

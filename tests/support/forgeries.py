@@ -33,7 +33,8 @@ TRUSTED = {
     r"certificate\.json:versions\..*": "Versions, times",
     r"spec\.json:sampling\..*|spec\.json:lipschitz\.residual\.(budget|boxes|pairs|distance|cells)": "budgets of the spec",
     r"spec\.json:((closed_loop|report|expect)\..*|controller\.(horizon|weights|reference|policy).*)": "budgets of the spec",
-    r"spec\.json:(model|backend)\..*": "residuals are those of it and of f|γ is what a person declares",
+    r"spec\.json:seed": "seed and budgets of the spec",
+    r"spec\.json:(model|backend)\..*": "residuals are those of (it and of )?f|γ is what a person declares",
     r"summary\.json:timings\..*": "Versions, times",
     r"figures\.json:lanes\.\d+\.at\..*": "Versions, times",
     r"controller/with_gamma/controller\.json:evidence\.(levels|rounds|reason|change|gap_over_cells).*": "rounds its games took",
@@ -46,6 +47,7 @@ TRUSTED = {
     r"samples/.*": "constants|What only f̂ can tell|stored transitions|order is trusted",
     r"certificate\.npz:(lipschitz|curvature.*|cells.*)": "constants",
     r"certificate\.json:warnings.*": "warned of slopes",
+    r"certificate\.json:recording\.book\.question": "number of the calibration",
     r"certificate\.npz:(held|fit)\..*|certificate\.json:recording\.rows\..*": "stored transitions",
     r"spec\.json:recording\..*|figures\.npz:/recorded/.*/t": "stored transitions",
 }
@@ -119,9 +121,12 @@ class Forger:
         data = json.loads(path.read_text())
         nodes = [(at, v) for at, v in leaves(data) if not _mended(name, at)]
         at, was = nodes[int(self.rng.integers(len(nodes)))]
-        if self.rng.random() < 0.15:
+        if (drawn := self.rng.random()) < 0.15:
             now: Any = _GONE
             remove(data, at)
+        elif drawn < 0.25 and name != "spec.json" and _guarded(data, at[:-1]):
+            at, was, now = (*at[:-1], "reviewed"), _GONE, "by everyone"
+            put(data, at, now)
         else:
             now = self.other(was)
             put(data, at, now)
@@ -335,6 +340,14 @@ def put(node: Any, at: tuple[Any, ...], value: Any) -> None:
     for key in at[:-1]:
         node = node[key]
     node[at[-1]] = value
+
+
+def _guarded(node: Any, at: tuple[Any, ...]) -> bool:
+    """Is it an object whose fields are known, rather than names?"""
+    for key in at:
+        node = node[key]
+    named = {"controller", "evidence", "goal", "form", "versions", "timings", "digests", "files", "beside", "spread", "at"}
+    return isinstance(node, dict) and not named & set(at)
 
 
 def remove(node: Any, at: tuple[Any, ...]) -> None:

@@ -33,16 +33,22 @@ class GradientElite(LipschitzEstimator):
     def __init__(self, safety: float = 1.2, budget: int = 15_000, distance: float = 1e-2, curvature: bool = False) -> None:
         self.safety, self.budget, self.distance, self.curvature = safety, budget, distance, curvature
 
+    def _pairs(self, axes: int) -> int:
+        return self.budget // (2 * (2 if self.curvature else 1) * axes)
+
+    def method(self, axes: int) -> str:
+        """What is told of it, where so many axes are asked along."""
+        return f"gradient-elite ({self._pairs(axes)} pairs in {THRESHOLDS.elite_rounds} rounds per axis)"
+
     def bound(self, problem: LipschitzProblem) -> LipschitzBound:
         """UsageError where the pairs are too close for the resolution, or too few for the rounds."""
         names = {j: a.name for j, a in enumerate(problem.domain.axes) if j not in problem.held}
-        share = 2 if self.curvature else 1
-        count = self.budget // (2 * share * len(names))
+        count = self._pairs(len(names))
         least = 4 * (THRESHOLDS.elite_rounds - 1 + THRESHOLDS.elite_first)
         if count < least:
             raise UsageError(
                 f"lipschitz gradient-elite: a budget of {self.budget} transitions is {count} pairs for each of "
-                f"{len(names)} axes; give at least {2 * share * least * len(names)}"
+                f"{len(names)} axes; give at least {2 * (2 if self.curvature else 1) * least * len(names)}"
             )
         pairs, values, diagnostics = dict[int, Close](), dict[int, tuple[Array, Array]](), dict[str, Any]()
         noise = 4 * problem.change_resolution
@@ -54,13 +60,13 @@ class GradientElite(LipschitzEstimator):
             pairs[j] = close
             diagnostics[name] = {"inert": still.tolist(), "largest_slope": seen.tolist(), "pairs": len(slope)}
             diagnostics[name]["largest_slope_of_random_pairs"] = first.slope.max(axis=0).tolist()
-        method = f"gradient-elite ({count} pairs in {THRESHOLDS.elite_rounds} rounds per axis)"
 
         def bent() -> Curvature:
             each = self.budget // (6 * len(names))
             return curvatures(problem, names, each, self.distance, self.safety, "gradient-elite")
 
-        return estimate(problem, pairs, values, diagnostics, method, self.safety, bent if self.curvature else None)
+        method, bends = self.method(len(names)), bent if self.curvature else None
+        return estimate(problem, pairs, values, diagnostics, method, self.safety, bends)
 
     def _search(self, problem: LipschitzProblem, j: int, name: str, count: int, noise: Array) -> tuple[Close, Close, Array]:
         """(pairs of the first round, all pairs, their slopes (n, nx), 0 where the resolution may fake them) along axis j."""

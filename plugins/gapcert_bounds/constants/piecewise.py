@@ -135,7 +135,8 @@ class _Search:
         self.at, self.sizes = np.concatenate([self.at, segments]), np.concatenate([self.sizes, sizes])
 
     def _constants(self, region: tuple[Array, Array]) -> Array:
-        """(nx, nz): what the pairs in and around a box say; beyond its width a slope would have shown, whatever the noise.
+        """(nx, nz): what the pairs in and around a box say, and what noise may hide: of a slope that was seen, noise over the
+        box; else noise over a pair, which is all that pairs tell.
 
         Around it, because a steep part that reaches into a corner of the box alone is met by few pairs inside.
         """
@@ -143,7 +144,8 @@ class _Search:
         slopes = self.pairs.steepest(
             self.pairs.within(region[0] - THRESHOLDS.cell_pad * width, region[1] + THRESHOLDS.cell_pad * width), self.pair_noise
         )
-        constants = self.options.safety * slopes + self.pair_noise[:, None] / width
+        hidden = np.where(slopes > 0, width, np.minimum(width, self.options.distance * self.domain.width))
+        constants = self.options.safety * slopes + self.pair_noise[:, None] / hidden
         constants[:, list(self.problem.held)] = 0.0
         return np.asarray(constants)
 

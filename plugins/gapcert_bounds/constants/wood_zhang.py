@@ -44,6 +44,10 @@ class WoodZhang(LipschitzEstimator):
         self.safety, self.pairs, self.batches, self.distance = safety, pairs, batches, distance
         self.curvature = curvature
 
+    def method(self, axes: int) -> str:
+        """What is told of it, where so many axes are asked along."""
+        return f"wood-zhang ({self.pairs} pairs in {self.batches} batches per axis)"
+
     def bound(self, problem: LipschitzProblem) -> LipschitzBound:
         """UsageError where the pairs are too close for the resolution."""
         names = {j: a.name for j, a in enumerate(problem.domain.axes) if j not in problem.held}
@@ -51,12 +55,11 @@ class WoodZhang(LipschitzEstimator):
         values, reports = dict[int, tuple[Array, Array]](), dict[str, Any]()
         for j, name in names.items():
             values[j], reports[name] = self._axis(problem, j, pairs[j])
-        method = f"wood-zhang ({self.pairs} pairs in {self.batches} batches per axis)"
 
         def bent() -> Curvature:
             return curvatures(problem, names, self.pairs, self.distance, self.safety, "wood-zhang")
 
-        return estimate(problem, pairs, values, reports, method, self.safety, bent if self.curvature else None)
+        return estimate(problem, pairs, values, reports, self.method(len(names)), self.safety, bent if self.curvature else None)
 
     def _ask(self, problem: LipschitzProblem, j: int, name: str) -> Close:
         rng = np.random.default_rng([problem.seed, j, 0x12F])

@@ -52,9 +52,13 @@ class EnvelopeGap(GapFunction):
         moves = lipschitz.any(axis=0)
         slope = predictor.arrays().get("slope") if predictor.kind in ("none", "affine") else np.ones_like(lipschitz)
         self._active = np.flatnonzero(moves if slope is None else moves | slope.any(axis=0))
-        self._largest = np.abs(g).max(axis=0)
-        affine = (predictor.offset, predictor.slope) if isinstance(predictor, AffinePredictor) else ()
-        self._numbers = [part.tolist() for part in (*affine, self._largest, 2 * resolution)]
+        self.rounded_with(np.abs(g).max(axis=0))
+
+    def rounded_with(self, largest: Array) -> None:
+        """The pad for rounding is that of samples up to `largest` (nx,)."""
+        p, self._largest = self.predictor, largest
+        affine = (p.offset, p.slope) if isinstance(p, AffinePredictor) else ()
+        self._numbers = [part.tolist() for part in (*affine, largest, 2 * self.resolution)]
 
     def interval(self, z: Array) -> tuple[Array, Array]:
         if len(z) == 1 and len(self._numbers) == 4:
@@ -173,12 +177,27 @@ class PiecewiseEnvelope(GapFunction):
         self._members, self._counts = np.concatenate(members), np.array([len(m) for m in members])
         self._starts = np.cumsum(self._counts) - self._counts
         self._slack = 2 * resolution + cells.jumps
+        self._nodes = list(zip(cells.axis.tolist(), cells.cut.tolist(), cells.child.tolist(), strict=True))
+        self._single: dict[int, EnvelopeGap] = {}
 
     def interval(self, z: Array) -> tuple[Array, Array]:
+        if len(z) == 1 and (one := self._around(z[0].tolist())) is not None:
+            return one.interval(z)
         cell = self.cells.locate(z)
         lower, upper = self._cones(z, cell)
         p, slack = self.predictor(z), self._slack[cell]
         return p + lower - slack - self._rounding(p, lower, cell), p + upper + slack + self._rounding(p, upper, cell)
+
+    def _around(self, z: list[float]) -> EnvelopeGap | None:
+        """What answers at one point as the whole does, to the same bits; None in a cell without samples."""
+        k = 0 if self._nodes else -1
+        while k >= 0:
+            axis, cut, child = self._nodes[k]
+            k = child[z[axis] > cut]
+        if (cell := -1 - k) not in self._single and self._counts[cell]:
+            self._single[cell] = self._inside(cell)
+            self._single[cell].rounded_with(np.abs(self.g).max(axis=0))
+        return self._single.get(cell)
 
     def interval_over(self, boxes: Interval) -> Interval:
         return Interval.hull(*self.ends_over(boxes))
@@ -233,8 +252,7 @@ class PiecewiseEnvelope(GapFunction):
     def _inside(self, c: int) -> EnvelopeGap:
         """The envelope that this is inside cell c, which has samples."""
         rows = self._members[self._starts[c] : self._starts[c] + self._counts[c]]
-        e = self.resolution + self.cells.jumps[c] / 2
-        return EnvelopeGap(self.z[rows], self.g[rows], self.cells.constants[c], e, self.predictor)
+        return EnvelopeGap(self.z[rows], self.g[rows], self.cells.constants[c], self._slack[c] / 2, self.predictor)
 
     def arrays(self) -> dict[str, Array]:
         own = {"z": self.z, "g": self.g, "L": self.cells.worst, "e": self.resolution}

@@ -59,6 +59,8 @@ class Saved:
     def checks(self) -> list[Check]:
         """What is checked of it, in order."""
         found: list[Check] = [("the controller is of this certificate", lambda e: self._certified())]
+        if self.on_cells or self.planned:
+            found.append(("the goal is written as it is read", _said(self._read)))
         if self.on_cells:
             return [
                 *found,
@@ -253,6 +255,11 @@ class Saved:
             return ""
         found = f"rests on certificate {named[:16]}…" if named else "names no certificate"
         return f"the saved controller {found}, and this one is {own[:16]}…; run the spec again"
+
+    def _read(self) -> str:
+        stated = self.data["goal"]
+        made = json.loads(json.dumps(Goal.from_data(stated).to_data()))
+        return "" if stated == made else f"the goal is stated as {stated}, and read as {made}"
 
     def _asked(self) -> str | None:
         """Goal, cells and inputs are those of the spec, the names and the box of states those of the certificate."""

@@ -217,6 +217,9 @@ def constants(e: Evidence, o: Origin) -> str | None:
     name, made = _estimator(e, o, stated["method"].partition(" ")[0])
     if stated["method"].partition(" ")[0] != name or stated["provenance"] != made.provenance:
         return f"the constants are stated as {stated['provenance']} by {stated['method']}, and the spec asks for {name}"
+    axes = len(o.domain.low) - len((e.data.get("symmetry") or {}).get("axes", ()))
+    if (said := getattr(made, "method", None)) is not None and said(axes) != stated["method"]:
+        return f"the constants are stated by {stated['method']}, and the spec asks for {said(axes)}"
     if stated["safety"] != getattr(made, "safety", 1.0):
         return f"safety is stated as {stated['safety']}, and the spec asks for {getattr(made, 'safety', 1.0)}"
     if any(s["safety_factor"] != stated["safety"] for s in e.data["states"].values()):

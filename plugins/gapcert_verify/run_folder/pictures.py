@@ -55,6 +55,8 @@ def _lanes(e: Evidence, drawn: Mapping[str, Any]) -> str:
         strange = [s for s in lane["states"] if not _STATE.fullmatch(s)]
         if strange or not _STAGE.fullmatch(lane["stage"]):
             return f"'{strange[0] if strange else lane['stage']}' is no stage, nor how one ends"
+        if len(lane["at"]) != len(lane["states"]) or lane["states"][-1] == "running":
+            return f"stage '{lane['stage']}' is drawn without an end"
         if lane["stage"] == "run" and lane["states"] not in (["running", told], [told]):
             return f"the run is drawn to have ended with {lane['states']}, and its verdict is {told}"
     return ""
