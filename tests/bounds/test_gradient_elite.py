@@ -167,14 +167,14 @@ def certified(folder, field, backend, **more):
 
 
 class Noisy(gc.Backend):
-    """A field whose answers carry noise that depends on the point alone, and that its resolution does not tell of."""
+    """A field whose answers carry waves that are too short for pairs, and too long to be taken for jitter."""
 
     def __init__(self, field, size):
         self.states, self.inputs, self.period = field.states, field.inputs, field.period
         self.field, self.size = field, size
 
     def _step(self, x, u, **options):
-        phase = 1e9 * np.hstack([x, u]).sum(axis=1)
+        phase = 1e5 * np.hstack([x, u]).sum(axis=1)
         return self.field.step(x, u).x + self.size * np.sin(phase)[:, None]
 
     def resolution(self, magnitude):
