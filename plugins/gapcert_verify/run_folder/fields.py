@@ -40,7 +40,7 @@ _ONE = {
     "domain": "axes units states period coordinates low high relations",
     "expectations": "met text value",
     "gap": "axes bands fixed samples slices",
-    "hidden": "names spread harmless ranked queries mode distribution attack bound sample ranges visited warnings added law",
+    "hidden": "mode names spread harmless distribution ranked queries bound safety attack",
     "lanes": "at stage states",
     "lipschitz": "method provenance safety cells marked marked_share jumps",
     "loop": "ahead axes escape foreseen learned period playback runs stay wanted",
