@@ -53,7 +53,7 @@ class Arithmetic:
             return cls(system.resolution(_size(system, points)))
         boxes, bound, least = domain.interval, over[:1], over[1:].max(axis=0)
         size = text.enclosure(boxes).mag
-        if (bound > text.resolution(size[0]) / 2).any():
+        if np.isinf(bound).any() or (bound > text.resolution(size[0]) / 2).any():
             boxes, bound = _covered(text, domain, bound, least)
             if not np.isfinite(bound).all():
                 stated = text.resolution(_size(text, points))
