@@ -60,7 +60,7 @@ class Saved:
         """What is checked of it, in order."""
         found: list[Check] = [("the controller is of this certificate", lambda e: self._certified())]
         if self.on_cells or self.planned:
-            found.append(("the goal is written as it is read", _said(self._read)))
+            found.append(("the controller and its goal are written as they are read", _said(self._read)))
         if self.on_cells:
             return [
                 *found,
@@ -257,6 +257,9 @@ class Saved:
         return f"the saved controller {found}, and this one is {own[:16]}…; run the spec again"
 
     def _read(self) -> str:
+        own = "held" if self.on_cells else "solver kept terminal adapt feedback"
+        if extra := sorted(self.data.keys() - set(f"digest evidence format goal kind {own}".split())):
+            return f"it has an unknown field {extra[0]!r}"
         stated = self.data["goal"]
         made = json.loads(json.dumps(Goal.from_data(stated).to_data()))
         return "" if stated == made else f"the goal is stated as {stated}, and read as {made}"

@@ -24,7 +24,6 @@ _TOP = {
     "summary.json": "certificate controller closed_loop expectations name reason run_dir timings verdict beside coordinates",
     "figures.json": "gap lanes loop recorded winning compare diagnosis",
     "run.json": "executor files folder name spec",
-    **{f"controller/{which}_gamma/controller.json": "digest evidence format goal kind solver" for which in ("with", "without")},
     "root.json": "root files",
 }
 _ONE = {
