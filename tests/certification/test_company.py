@@ -155,6 +155,22 @@ def test_last_bits_are_counted_in_e_and_said(tmp_path):
         certified(LastBits(40), tmp_path / "more")
 
 
+class Counting(LastBits):
+    """All calls but the first are a little off."""
+
+    calls = 0
+
+    def _step(self, x, u, **options):
+        self.calls += 1
+        out = self.inner.law(np.hstack([x, u]))
+        return out + self.ulp * np.spacing(np.abs(out)) * (self.calls > 1)
+
+
+def test_the_same_call_again_has_the_same_bits_though_e_allows_others(tmp_path):
+    with pytest.raises(gc.UsageError, match=r"not a function of .* asked again in the same call"):
+        certified(Counting(1), tmp_path)
+
+
 def test_ladders_have_neighbours_at_every_scale():
     system, rng = Circumstantial("first row"), np.random.default_rng(0)
     rows = laddered(system, Queries(rng.uniform(-1, 1, (8, 2)), rng.uniform(-1, 1, (8, 1))))
