@@ -106,6 +106,32 @@ FORGERIES: dict[str, tuple[str, str, Any, str]] = {
         lambda d: [s.update(constant_bound=1e9) for s in d["states"].values()],
         "bounds the envelope",
     ),
+    "more pairs": (
+        "statistical",
+        "certificate.json",
+        lambda d: d["lipschitz"].update(method=d["lipschitz"]["method"].replace("pairs", "000 pairs").replace(" 000", "000")),
+        "the spec asks for",
+    ),
+    "a field": ("statistical", "certificate.json", lambda d: d.update(reviewed="by everyone"), "unknown field 'reviewed'"),
+    "a field of a state": (
+        "statistical",
+        "certificate.json",
+        lambda d: d["states"]["x"].update(seen=1),
+        "unknown field 'seen' of x",
+    ),
+    "a field of the answer": ("statistical", "summary.json", lambda d: d.update(approved=True), "unknown field 'approved'"),
+    "a field of a picture": (
+        "statistical",
+        "figures.json",
+        lambda d: d["gap"].update(note="exact"),
+        "unknown field 'note' in 'gap'",
+    ),
+    "a domain without relations": (
+        "statistical",
+        "certificate.json",
+        lambda d: d["domain"].pop("relations"),
+        "lacks relations",
+    ),
     "nothing, and digests made anew": ("statistical", "certificate.json", lambda d: d["lipschitz"].update(safety=1.2), ""),
 }
 
