@@ -140,7 +140,20 @@ class Certified(Statement):
         z = np.concatenate([x, u], axis=1)
         for j, low, high in self._turning:
             z[:, j] = circle.onto(low, high, z[:, j])
-        return z if self.relative is None else self.relative.over(Interval.exact(z)).mid
+        if self.relative is None:
+            return z
+        (slope, scale), nx = self._shifted, self.model.nx
+        w = z[:, nx:] * scale
+        for j in range(nx):  # in this order in batches of any size
+            w += z[:, j : j + 1] * slope[j]
+        return np.hstack([z[:, :nx], w])
+
+    @cached_property
+    def _shifted(self) -> tuple[Array, Array]:
+        """Slopes (nx, nu) and scales (nu,) of relative inputs."""
+        assert self.relative is not None, "inputs are relative"
+        held = self.relative.arrays()
+        return np.ascontiguousarray(held["slope_of_w"].T), held["scale_of_w"]
 
     @cached_property
     def _turning(self) -> list[tuple[int, float, float]]:
