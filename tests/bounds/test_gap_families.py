@@ -204,6 +204,14 @@ def test_constant_on_route_theorem1_is_the_largest_sample_and_the_margin():
     assert np.allclose(value, expected, rtol=1e-12)
 
 
+def test_a_constant_that_no_float_holds_is_refused():
+    """Constants of 1e160 are numbers, and their norm is not."""
+    huge = gap_problem(Waves.smooth(), (5, 5, 5), route="theorem1")
+    huge = replace(huge, lipschitz=replace(huge.lipschitz, value=np.full_like(huge.lipschitz.value, 1e160)))
+    with pytest.raises(gc.UsageError, match=r"γ = \[inf.* is no bound: .*; narrow the domain"):
+        Constant().fit(huge)
+
+
 def test_theorem1_needs_a_cover_and_no_predictor():
     plain = gap_problem(Waves.smooth(), (5, 5, 5))
     with pytest.raises(gc.UsageError, match="no uniform cover; use `sampling"):

@@ -263,6 +263,9 @@ NUMBERS += [
     (None, "–"),
     (True, "yes"),
     ("text", "text"),
+    (float("inf"), "∞"),
+    (float("-inf"), "−∞"),
+    (float("nan"), "no number"),
     (-2.5e8, "-2.5\u00a0×\u00a010⁸"),
     (0.001, "0.001"),
 ]

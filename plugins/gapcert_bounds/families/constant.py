@@ -7,7 +7,7 @@ from typing import Any, final
 
 import numpy as np
 
-from gapcert.plugin import Array, GapFamily, GapFunction, GapProblem, Interval, Pulse, supremum
+from gapcert.plugin import Array, GapFamily, GapFunction, GapProblem, Interval, Pulse, UsageError, supremum
 from gapcert_bounds.constants.declared_constants import named
 
 from .envelope import Envelope
@@ -19,6 +19,8 @@ class ConstantGap(GapFunction):
     """γ_i on all of Z, and [−γ_i, γ_i]. value (nx,)."""
 
     def __init__(self, value: Array, family: str = "constant") -> None:
+        if not np.isfinite(value).all():
+            raise UsageError(f"gap: γ = {value.tolist()} is no bound: it is beyond what floats hold; narrow the domain")
         self.value, self.family = value, family
 
     def interval(self, z: Array) -> tuple[Array, Array]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -59,6 +60,8 @@ def number(value: Any, digits: int = 4) -> str:
         return f"{value:,}"
     if not isinstance(value, float):
         return str(value)
+    if not math.isfinite(value):
+        return "no number" if math.isnan(value) else "∞" if value > 0 else "−∞"
     mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
     if value == 0 or -3 <= int(exponent) < 6:
         return f"{value:,.{max(0, digits - 1 - int(exponent))}f}" if value and int(exponent) >= 3 else f"{value:.{digits}g}"
