@@ -130,7 +130,7 @@ FORGERIES: dict[str, tuple[str, str, Any, str]] = {
         "statistical",
         "certificate.json",
         lambda d: d["domain"].pop("relations"),
-        "lacks relations",
+        "the domain lacks relations",
     ),
     "nothing, and digests made anew": ("statistical", "certificate.json", lambda d: d["lipschitz"].update(safety=1.2), ""),
 }

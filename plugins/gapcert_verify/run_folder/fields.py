@@ -77,8 +77,11 @@ def fields(e: Evidence) -> str:
     for name, state in e.data["states"].items():
         if extra := sorted(state.keys() - set(_STATE.split())):
             return f"certificate.json has an unknown field {extra[0]!r} of {name}"
-    lost = set(_ONE["domain"].split()) - e.data["domain"].keys()
-    return f"certificate.json lacks {min(lost)} in 'domain'" if lost and not e.older else ""
+    whole = [("figures.json", _TOP["figures.json"], read(e, "figures.json")), ("the domain", _ONE["domain"], e.data["domain"])]
+    for name, known, found in whole:
+        if found is not None and not e.older and (lost := sorted(set(known.split()) - found.keys())):
+            return f"{name} lacks {lost[0]}"
+    return ""
 
 
 def _objects(node: Any, name: str, known: str | None, where: str = "") -> Iterator[tuple[str, str, dict[str, Any]]]:
