@@ -48,6 +48,9 @@ TRUSTED = {
     r"certificate\.npz:(lipschitz|curvature.*|cells.*)": "constants",
     r"certificate\.json:warnings.*": "warned of slopes",
     r"certificate\.json:recording\.book\.question": "number of the calibration",
+    r"figures\.json:recorded\.at": "stored transitions",
+    r"controller/.*:evidence\.(tube|reference|terminal_margin|domain_fraction)\b.*": "figures of the reference",
+    r"controller/.*:evidence\.solver\b.*": "how solvers were tuned",
     r"certificate\.npz:(held|fit)\..*|certificate\.json:recording\.rows\..*": "stored transitions",
     r"spec\.json:recording\..*|figures\.npz:/recorded/.*/t": "stored transitions",
 }

@@ -136,7 +136,8 @@ class Saved:
     @property
     def _of_plans(self) -> list[str]:
         out = [
-            "What solvers answer is checked as a run goes on: plans, corridors and the figures of the domain are as stated.",
+            "What solvers answer is checked as a run goes on: plans, corridors, how solvers were tuned, and the figures of the "
+            "reference, the tube, its end and the domain are as stated.",
             "The controller without γ promises nothing of f̂: it was not looked at.",
         ]
         with suppress(UsageError, *DAMAGE):
@@ -337,6 +338,8 @@ class Saved:
         steps = len(self.arrays["stages.A"]) - 1
         if steps != self._section.get("horizon", 20):
             return f"it plans {steps} steps, and the spec asks for {self._section.get('horizon', 20)}"
+        if (stated := self.data["evidence"].get("horizon", steps)) != steps:
+            return f"it plans {steps} steps, and {stated} are stated"
         return asked.another(Goal.from_data(self.data["goal"]), "mpc")
 
     def _plan(self, check: Callable[[Plans], str | None]) -> str | None:

@@ -77,7 +77,12 @@ def fields(e: Evidence) -> str:
     for name, state in e.data["states"].items():
         if extra := sorted(state.keys() - set(_STATE.split())):
             return f"certificate.json has an unknown field {extra[0]!r} of {name}"
-    whole = [("figures.json", _TOP["figures.json"], read(e, "figures.json")), ("the domain", _ONE["domain"], e.data["domain"])]
+    drawn = read(e, "figures.json")
+    whole = [("figures.json", _TOP["figures.json"], drawn), ("the domain", _ONE["domain"], e.data["domain"])]
+    drawn = drawn or {}
+    for part, one in (("gap", "slices"), ("gap", "bands"), ("recorded", "stretches")):
+        whole += [(f"a picture of {one}", _ONE[one], found) for found in (drawn.get(part) or {}).get(one, ())]
+    whole += [("the picture of recordings", _ONE["recorded"], drawn.get("recorded") or None)]
     for name, known, found in whole:
         if found is not None and not e.older and (lost := sorted(set(known.split()) - found.keys())):
             return f"{name} lacks {lost[0]}"

@@ -145,6 +145,8 @@ def _slices(e: Evidence, o: Origin, figure: Mapping[str, Any], arrays: Mapping[s
     rows = np.flatnonzero(inside)[::step]
     low, high = _ends(e, o, z[rows])
     for i, drawn in enumerate(figure["slices"]):
+        if text := _called(o.domain.axes[i].name, o.domain.axes[i].unit, drawn):
+            return text
         gamma, gap = (arrays[drawn[k]].ravel() for k in ("gamma", "gap"))
         made = np.maximum(np.abs(low[:, i]), np.abs(high[:, i]))
         size, rounded = float(made.max(initial=0.0)), float(e.arrays["remainder.resolution"][i])
@@ -155,6 +157,11 @@ def _slices(e: Evidence, o: Origin, figure: Mapping[str, Any], arrays: Mapping[s
     return ""
 
 
+def _called(name: str, unit: str, drawn: Mapping[str, Any]) -> str:
+    same = (drawn["state"], drawn["unit"]) == (name, pretty(unit))
+    return "" if same else f"{name} in {pretty(unit)} is called {drawn['state']} in {drawn['unit']} in a picture"
+
+
 def _recorded(e: Evidence, figure: Mapping[str, Any], arrays: Mapping[str, Array]) -> str:
     held, r = e.arrays["held.window"], e.arrays["held.r"]
     low, high = (np.sort(order_statistics.worst(own, held)) for own in scores(e, e.arrays["held.z"], [r]))
@@ -163,6 +170,11 @@ def _recorded(e: Evidence, figure: Mapping[str, Any], arrays: Mapping[str, Array
     if figure["rank"] != rank or drawn.shape != low.shape or not ((low - room <= drawn) & (drawn <= high + room)).all():
         return "the scores are drawn otherwise than they are"
     for i, stretch in enumerate(figure["stretches"]):
+        z = e.data["domain"]
+        if (text := _called(z["axes"][i], z["units"][i], stretch)) or arrays[stretch["t"]].shape != arrays[
+            stretch["low"]
+        ].shape:
+            return text or f"a stretch of {stretch['state']} has no times"
         rows = [np.flatnonzero(r[:, i] == v) for v in arrays[stretch["residual"]]]
         if not all(len(found) for found in rows):
             return f"a residual of {stretch['state']} is drawn that was not measured"
