@@ -184,7 +184,9 @@ def test_a_slope_that_a_predictor_takes_away_leaves_that_of_rounding() -> None:
 def test_bounds_that_are_no_numbers_are_violations() -> None:
     """NaN is neither below nor above a residual: an audit that asks for either would find nothing wrong."""
 
-    for flags in _violations(ConstantGap(np.array([np.nan])), np.zeros((5, 2)), np.zeros((5, 1))):
+    gap = ConstantGap(np.zeros(1))
+    gap.value = np.array([np.nan])
+    for flags in _violations(gap, np.zeros((5, 2)), np.zeros((5, 1))):
         assert flags.all()
 
 

@@ -79,6 +79,7 @@ def fields(e: Evidence) -> str:
             return f"certificate.json has an unknown field {extra[0]!r} of {name}"
     drawn = read(e, "figures.json")
     whole = [("figures.json", _TOP["figures.json"], drawn), ("the domain", _ONE["domain"], e.data["domain"])]
+    whole += [("certificate.json", _BESIDE, e.data)] if "audit" in e.data else []
     drawn = drawn or {}
     for part, one in (("gap", "slices"), ("gap", "bands"), ("recorded", "stretches")):
         whole += [(f"a picture of {one}", _ONE[one], found) for found in (drawn.get(part) or {}).get(one, ())]
