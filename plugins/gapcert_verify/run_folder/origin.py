@@ -174,7 +174,10 @@ def question(e: Evidence, o: Origin) -> str:
     asked |= {"family": a["family"].name, "route": "calibrate" if recording else "declared" if bare else o.route}
     if other := next((k for k, v in asked.items() if data[k] != v), ""):
         return f"{other} is stated as {data[other]}, and the spec asks for {asked[other]}"
-    return _level(e, o)
+    functions = getattr(a["family"], "functions", None)
+    if data["form"]["form"] == "basis" and functions is not None and list(functions) != data["form"]["text"]:
+        return f"functions are stated as {data['form']['text']}, and the spec asks for {list(functions)}"
+    return "a recording covers nothing" if recording and data.get("cover") is not None else _level(e, o)
 
 
 def _level(e: Evidence, o: Origin) -> str:

@@ -72,6 +72,8 @@ def _gap(e: Evidence, o: Origin, figure: Mapping[str, Any], arrays: Mapping[str,
         return "there is no band for each state along each axis"
     for k, band in enumerate(figure["bands"]):
         j, i = divmod(k, nx)
+        if text := _placed(f"/gap/bands/{k}", band, ("at", "low", "high", "gamma", "residual")):
+            return text
         points = np.tile(z.centre, (len(arrays[band["at"]]), 1))
         points[:, j] = arrays[band["at"]]
         own = {"state": axes[i]["name"], "unit": axes[i]["unit"], "axis": axes[j]}
@@ -145,7 +147,8 @@ def _slices(e: Evidence, o: Origin, figure: Mapping[str, Any], arrays: Mapping[s
     rows = np.flatnonzero(inside)[::step]
     low, high = _ends(e, o, z[rows])
     for i, drawn in enumerate(figure["slices"]):
-        if text := _called(o.domain.axes[i].name, o.domain.axes[i].unit, drawn):
+        own = _placed(f"/gap/slices/{i}", drawn, ("gamma", "gap"))
+        if text := own or _called(o.domain.axes[i].name, o.domain.axes[i].unit, drawn):
             return text
         gamma, gap = (arrays[drawn[k]].ravel() for k in ("gamma", "gap"))
         made = np.maximum(np.abs(low[:, i]), np.abs(high[:, i]))
@@ -155,6 +158,10 @@ def _slices(e: Evidence, o: Origin, figure: Mapping[str, Any], arrays: Mapping[s
         if o.text and (np.abs(gap[inside] - np.abs(o.residual(z[inside])[:, i])) > 2 * e.arrays["resolution"][i]).any():
             return f"|r| of state {i} is drawn otherwise than it is"
     return ""
+
+
+def _placed(where: str, drawn: Mapping[str, Any], names: Sequence[str]) -> str:
+    return next((f"{where}/{n} is said to be {drawn[n]}" for n in names if drawn[n] != f"{where}/{n}"), "")
 
 
 def _called(name: str, unit: str, drawn: Mapping[str, Any]) -> str:
@@ -170,8 +177,8 @@ def _recorded(e: Evidence, figure: Mapping[str, Any], arrays: Mapping[str, Array
     if figure["rank"] != rank or drawn.shape != low.shape or not ((low - room <= drawn) & (drawn <= high + room)).all():
         return "the scores are drawn otherwise than they are"
     for i, stretch in enumerate(figure["stretches"]):
-        z = e.data["domain"]
-        if (text := _called(z["axes"][i], z["units"][i], stretch)) or arrays[stretch["t"]].shape != arrays[
+        z, own = e.data["domain"], _placed(f"/recorded/stretches/{i}", stretch, ("t", "low", "high", "residual"))
+        if (text := own or _called(z["axes"][i], z["units"][i], stretch)) or arrays[stretch["t"]].shape != arrays[
             stretch["low"]
         ].shape:
             return text or f"a stretch of {stretch['state']} has no times"
