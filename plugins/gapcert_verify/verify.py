@@ -199,7 +199,10 @@ def _trusted(e: Evidence, source: Origin | str | UsageError) -> list[str]:
 
 
 _ONLY = "What only f̂ can tell, that residuals are those of it and of f"
-_RECORDED = "all of the recording's that begin in Z, measured when they are drawn to be, and their residuals are those of f"
+_RECORDED = (
+    "all of the recording's that begin in Z, of as many trajectories, and fitted to as many transitions, as are told, measured "
+    "when they are drawn to be, and their residuals are those of f"
+)
 _BOOKED = "what the book beside the run folders counted; the book was not looked at."
 _NOBODY = "γ is what a person declares. No simulator was asked."
 

@@ -49,6 +49,7 @@ TRUSTED = {
     r"certificate\.json:warnings.*": "warned of slopes",
     r"certificate\.json:recording\.book\.question": "number of the calibration",
     r"figures\.json:recorded\.at": "stored transitions",
+    r"certificate\.json:recording\.(trajectories|transitions\.fit)": "as many trajectories, and fitted to",
     r"controller/.*:evidence\.(tube|reference|terminal_margin|domain_fraction)\b.*": "figures of the reference",
     r"controller/.*:evidence\.solver\b.*": "how solvers were tuned",
     r"certificate\.npz:(held|fit)\..*|certificate\.json:recording\.rows\..*": "stored transitions",

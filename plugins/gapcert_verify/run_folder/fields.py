@@ -21,6 +21,7 @@ _STATE = (
     "gap_mean gamma_mean gamma_max constant_bound safety_factor resolved vacuous envelope_mean tightness tightness_vs_envelope "
     "overpowered"
 )
+_RECORDING = "copies rank rows score trajectories transitions units widening window windows"
 _TOP = {
     "certificate.json": f"{_SUMMARY} {_BESIDE}",
     "summary.json": "certificate controller closed_loop expectations name reason run_dir timings verdict beside coordinates",
@@ -46,7 +47,7 @@ _ONE = {
     "lipschitz": "method provenance safety cells marked marked_share jumps",
     "loop": "ahead axes escape foreseen learned period playback runs stay wanted",
     "recorded": "at rank scores stretches",
-    "recording": "book copies number rank rows score trajectories transitions units widening window windows",
+    "recording": f"book number {_RECORDING}",
     "policies": _ROW,
     "relations": "text a b",
     "rows": "all no_transition outside",
@@ -80,6 +81,8 @@ def fields(e: Evidence) -> str:
     drawn = read(e, "figures.json")
     whole = [("figures.json", _TOP["figures.json"], drawn), ("the domain", _ONE["domain"], e.data["domain"])]
     whole += [("certificate.json", _BESIDE, e.data)] if "audit" in e.data else []
+    if (of := e.data.get("recording")) is not None:
+        whole += [("certificate.json", "cover seed digests", e.data), ("the recording", _RECORDING, of)]
     drawn = drawn or {}
     for part, one in (("gap", "slices"), ("gap", "bands"), ("recorded", "stretches")):
         whole += [(f"a picture of {one}", _ONE[one], found) for found in (drawn.get(part) or {}).get(one, ())]

@@ -300,6 +300,8 @@ def resolved(e: Evidence, o: Origin) -> str | None:
 def predicted(e: Evidence, o: Origin) -> str | None:
     """An affine predictor is the one that fits the first samples; stored values are those of the one that is stated."""
     kind = e.data["predictor"]
+    if kind not in ("none", "affine", "multilinear", "model"):
+        return f"{kind!r} is no predictor"
     if kind == "model" and not isinstance(o.asked["predictor"], Model):
         return "the predictor is stated as a model, and the spec names none"
     if kind == "none" and any(np.any(e.arrays.get(f"predictor.{k}", 0.0)) for k in ("offset", "slope")):
@@ -353,6 +355,8 @@ def arithmetic(e: Evidence, o: Origin) -> str | None:
         return "how e is known is left out"
     if o.whole:
         seen = stated[0].get("jitter")
+        if seen is not None and len(seen) != o.domain.nx:
+            return f"{len(seen)} states are said to jitter, of {o.domain.nx}"
         made = [a.to_data() for a in o.residual.arithmetic(o.domain, None if seen is None else np.array(seen))]
     else:
         made = [stated[0], Residual(o.model, o.model).arithmetic(o.domain)[1].to_data()]
@@ -447,10 +451,12 @@ def _alike(a: Any, b: Any) -> bool:
 
 def strength(e: Evidence, o: Origin) -> str | None:
     """Where γ exceeds half of what inputs can do, and whether nothing would move as well, as the model says."""
-    if "audit" not in e.data or "digests" not in e.data:
+    if "recording" in e.data:
+        (z, r), (low, high) = (e.arrays[f"held.{n}"] for n in "zr"), bounds(e, e.arrays["held.z"], "predictor.calibration")
+    elif "audit" not in e.data or "digests" not in e.data:
         return None
-    z, r = e.audit
-    low, high = e.audited
+    else:
+        (z, r), (low, high) = e.audit, e.audited
     gamma = np.maximum(np.abs(low.lo), np.abs(high.hi))
     x, u = o.domain.split(z)
     still = np.abs(difference(o.model.states, o.model.step(x, u).x, x) + r).mean(axis=0)
