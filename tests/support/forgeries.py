@@ -32,7 +32,7 @@ OWN = {"format", "form", "predictor", "domain", "arrays", "versions", "symmetry"
 TRUSTED = {
     r"certificate\.json:versions\..*": "Versions, times",
     r"spec\.json:sampling\..*|spec\.json:lipschitz\.residual\.(budget|boxes|pairs|distance|cells)": "budgets of the spec",
-    r"spec\.json:((closed_loop|report|expect)\..*|controller\.(horizon|weights|reference|policy).*)": "budgets of the spec",
+    r"spec\.json:((closed_loop|report|expect)\..*|controller\.(horizon|weights|reference|policy|refine).*)": "budgets of the spec",
     r"spec\.json:seed": "seed and budgets of the spec",
     r"spec\.json:(model|backend)\..*": "residuals are those of (it and of )?f|γ is what a person declares",
     r"summary\.json:timings\..*": "Versions, times",
