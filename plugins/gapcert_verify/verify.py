@@ -157,6 +157,7 @@ def _trusted(e: Evidence, source: Origin | str | UsageError) -> list[str]:
         alike = "independent draws of one distribution" if "beta" in e.data["claim"] else "exchangeable"
         told += [
             (f"The stored transitions are {_RECORDED}.", True),
+            ("The numbers of trajectories and of fitted transitions are as stated.", True),
             ("Which rows of the recording are copies of others is as stated.", sentences.copies(e)),
             (f"The number of the calibration is {_BOOKED}", "book" in e.data["recording"]),
             (f"The windows, and the one that the claim is about, are {alike}, chosen before anyone looked at these.", True),
@@ -199,10 +200,7 @@ def _trusted(e: Evidence, source: Origin | str | UsageError) -> list[str]:
 
 
 _ONLY = "What only f̂ can tell, that residuals are those of it and of f"
-_RECORDED = (
-    "all of the recording's that begin in Z, of as many trajectories, and fitted to as many transitions, as are told, measured "
-    "when they are drawn to be, and their residuals are those of f"
-)
+_RECORDED = "all of the recording's that begin in Z, measured when they are drawn to be, and their residuals are those of f"
 _BOOKED = "what the book beside the run folders counted; the book was not looked at."
 _NOBODY = "γ is what a person declares. No simulator was asked."
 

@@ -37,7 +37,7 @@ class GradientElite(LipschitzEstimator):
         return self.budget // (2 * (2 if self.curvature else 1) * axes)
 
     def method(self, axes: int) -> str:
-        """What is told of it, where so many axes are asked along."""
+        """Its description in a certificate, for pairs along so many axes."""
         return f"gradient-elite ({self._pairs(axes)} pairs in {THRESHOLDS.elite_rounds} rounds per axis)"
 
     def bound(self, problem: LipschitzProblem) -> LipschitzBound:

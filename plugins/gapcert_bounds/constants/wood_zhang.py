@@ -45,7 +45,7 @@ class WoodZhang(LipschitzEstimator):
         self.curvature = curvature
 
     def method(self, axes: int) -> str:
-        """What is told of it, where so many axes are asked along."""
+        """Its description in a certificate, for pairs along so many axes."""
         return f"wood-zhang ({self.pairs} pairs in {self.batches} batches per axis)"
 
     def bound(self, problem: LipschitzProblem) -> LipschitzBound:

@@ -161,7 +161,7 @@ def _slices(e: Evidence, o: Origin, figure: Mapping[str, Any], arrays: Mapping[s
 
 
 def _placed(where: str, drawn: Mapping[str, Any], names: Sequence[str]) -> str:
-    return next((f"{where}/{n} is said to be {drawn[n]}" for n in names if drawn[n] != f"{where}/{n}"), "")
+    return next((f"{where}/{n} is stated as {drawn[n]}" for n in names if drawn[n] != f"{where}/{n}"), "")
 
 
 def _called(name: str, unit: str, drawn: Mapping[str, Any]) -> str:
