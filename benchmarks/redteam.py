@@ -7,7 +7,8 @@
 Kinds are the modules of `attacks`. Deterministic claims may not break at all. Of a statistical one (ε, β) the share of violated
 points, drawn as its audit draws, may be significantly above ε (one-sided binomial test, 1e-3) in no more claims than β allows
 (0.99 quantile of a binomial distribution). Claim k of a seed is always the same. Each is kept as a line of JSON with
-the commit that it was asked of, and asked again at another one. An attempt that ends in neither claim nor reason is an error.
+the commit that it was asked of, and asked again at another one. An attempt that ends in neither claim nor reason is an error,
+and so is an honest run that `verify` refuses.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ import harness
 import numpy as np
 from attacks import KINDS, Attempt
 from scipy.stats import binom
+
+from gapcert_verify import verify_run
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "runs" / "redteam.jsonl"
@@ -60,6 +63,8 @@ def asked(kind: str, seed: int, k: int, tries: int | None) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         try:
             made = importlib.import_module(f"attacks.{kind}").attempt(rng, Path(folder), **more)
+            if why := _doubted(Path(folder)):
+                made = Attempt("error", case={"why": why, **made.case})
         except TimeoutError:
             made = Attempt("refused", case={"why": f"more than {PATIENCE} s"})
         except Exception as error:
@@ -67,6 +72,13 @@ def asked(kind: str, seed: int, k: int, tries: int | None) -> dict[str, Any]:
         finally:
             signal.alarm(0)
     return {"kind": kind, "seed": seed, "k": k, **asdict(made), "seconds": round(time.monotonic() - began, 2)}
+
+
+def _doubted(folder: Path) -> str:
+    """What `verify` finds wrong with the runs that were made here, all of them honest."""
+    runs = [path.parent for path in sorted(folder.glob("*/certificate.json"))]
+    found = [check for run in runs for check in verify_run(run)["checks"] if not check["passed"]]
+    return f"verify refuses an honest run: {found[0]['check']}: {found[0]['detail']}" if found else ""
 
 
 def _late(*_: object) -> None:

@@ -92,11 +92,13 @@ class Mpc(Synthesizer):
             from .variants.disturbance import answering
 
             return answering(task)
-        if asked.terminal is not None:
-            return handed(task)
         if asked.adapt:
             return adaptive(task, self._of_boxes, Mpc(**self._of_boxes).for_box)
-        return reaching(task) if problem.goal.kind == "reach_avoid" else regulating(task)
+        if asked.terminal is None and problem.goal.kind != "reach_avoid":
+            return regulating(task)
+        variant = reaching if asked.terminal is None else handed
+        made = variant(task)
+        return made if made.wins else task.weak(str(made.evidence["reason"]), lambda other: variant(other).wins)
 
     def for_box(self, problem: SynthesisProblem, like: MpcController | None) -> MpcController:
         """For one box of the parameters; those after the first have its gain and its solver, and are made as a run goes on."""

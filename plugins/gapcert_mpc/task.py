@@ -122,7 +122,7 @@ class Task:
             return False
 
         if held(domain.inputs):
-            return self.nothing(reason)
+            return self.nothing(reason if self.problem.gap is None else f"{reason}; for γ = 0 there would be a controller")
         if (wider := sufficient(held, domain.inputs)) is None:
             return self.nothing(f"{reason}; for γ = 0, inputs {FAR} times as wide do not help either")
         names = " and ".join(domain.inputs.names)

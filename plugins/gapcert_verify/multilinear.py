@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from gapcert.plugin import Array, Interval, Zone, cells, worst
+from gapcert.plugin import Array, Interval, Zone, cells, cut, joined, ranges, rounding, slopes, worst
 
 Arrays = Mapping[str, Array]
 _BLOCK = 1 << 18  # entries of a working array, which a cache then holds
@@ -78,6 +78,77 @@ def _allowed(arrays: Arrays, zone: Zone, axes: Sequence[Array], z: Array) -> Int
         bent = Interval.exact(np.where(np.isinf(bend), np.finfo(float).max, bend) / 2)
         product = (Interval.exact(inside) - low) * (Interval.exact(high) - inside)
         total = total + steep.minimum(bent) * product[:, None]
+    return total
+
+
+def over(arrays: Arrays, zone: Zone, g: Interval, boxes: Interval) -> Interval:
+    """Contains [l − p, u − p] over boxes (n, nz), which are cut at the nodes: of each part the range of what lies between the
+    nodes' values, with the most that curvature, or slopes, allow it to miss; or, where that is less, the band at its middle and
+    what slopes add to it.
+    """
+    axes = nodes(arrays, zone, "gap")
+    counts, nx = [len(a) for a in axes], len(arrays["resolution"])
+    own = g[-int(np.prod(counts)) :]
+    grid = own.reshape(*counts, nx)
+    starts, parts, *_ = cut(axes, boxes, *cells(axes, boxes.lo, boxes.hi))
+    pad = rounding(len(axes)) * float(g.mag.max())
+    low, high = ranges(axes, grid.lo, parts.lo, parts.hi)[0] - pad, ranges(axes, grid.hi, parts.lo, parts.hi)[1] + pad
+    wide = (Interval.exact(arrays["remainder.resolution"]) * 2.0 + _missed(arrays, zone, axes, parts)).hi
+    flat = Interval(low, high) + Interval(-wide, wide)
+    c = parts.mid
+    ends = band(arrays, zone, c, Interval.exact(np.zeros((len(c), nx))), own)
+    moves = [(slope * (parts - c)[:, None]).sum(-1) for slope in _slopes(arrays, zone, axes, grid, parts)]
+    below, above = (end + move for end, move in zip(ends, moves, strict=True))
+    return joined(starts, Interval(np.maximum(flat.lo, below.lo), np.minimum(flat.hi, above.hi)))
+
+
+def _slopes(arrays: Arrays, zone: Zone, axes: Sequence[Array], g: Interval, boxes: Interval) -> tuple[Interval, Interval]:
+    """Contain the slopes of l − p and of u − p over boxes, (n, nx, nz): those of g between its nodes ∓ those of what is missed,
+    min(H_ij / 2, 2 L_ij / h) (a + b − 2 z_j).
+    """
+    constants, bends = arrays["lipschitz"], list[Interval]()
+    for j, a in enumerate(axes):
+        most, z = np.tile(constants[:, j], (len(boxes), 1)), boxes[:, j]
+        if len(a) > 1:
+            k = np.clip(np.searchsorted(a, z.lo, "right") - 1, 0, len(a) - 2)
+            alone = (z.lo >= a[k]) & (z.hi <= a[k + 1])
+            h = Interval.exact(a[1:]) - a[:-1]
+            bend = np.minimum(curvature(arrays, zone, j, a), np.finfo(float).max)
+            least = (Interval.exact(2 * constants[:, j : j + 1]) / h).minimum(Interval.exact(bend / 2))
+            turned = least[:, k] * (Interval.exact(a[k]) + a[k + 1] - z * 2.0)
+            most = np.maximum(most, (least * h).hi.max(axis=1))
+            most = Interval(np.where(alone, turned.lo, -most.T).T, np.where(alone, turned.hi, most.T).T)
+        bends.append(most if isinstance(most, Interval) else Interval(-most, most))
+    low, high = slopes(axes, g.mid, boxes.lo, boxes.hi)
+    least_h = np.array([np.diff(a).min(initial=np.inf) for a in axes])
+    pad = 2 * (float(g.rad.max()) + 2 * rounding(len(axes)) * float(g.mag.max())) / least_h
+    between, bent = Interval(low - pad, high + pad), Interval.stack(bends, axis=2)
+    return between - bent, between + bent
+
+
+def _missed(arrays: Arrays, zone: Zone, axes: Sequence[Array], boxes: Interval) -> Interval:
+    """Σ_j max over the box of min(H_ij / 2, 2 L_ij / h) (z_j − a)(b − z_j); L_ij |z_j − a| along an axis with one node."""
+    constants = arrays["lipschitz"]
+    total = Interval.exact(np.zeros((len(boxes), len(constants))))
+    for j, a in enumerate(axes):
+        z = boxes[:, j]
+        beyond = np.maximum(np.maximum(a[0] - z.lo, z.hi - a[-1]), 0.0)
+        total = total + Interval.exact(constants[:, j]) * Interval.around(beyond, 0.0)[:, None]
+        if len(a) < 2:
+            continue
+        # At most h² / 4 of each interval that the box touches, and what the ends allow where it is one alone.
+        first = np.clip(np.searchsorted(a, z.lo, "right") - 1, 0, len(a) - 2)
+        last = np.maximum(np.clip(np.searchsorted(a, z.hi, "left") - 1, 0, len(a) - 2), first)
+        h = Interval.exact(a[1:]) - a[:-1]
+        steep = Interval.exact(2 * constants[:, j : j + 1]) / h
+        bend = curvature(arrays, zone, j, a)
+        least = steep.minimum(Interval.exact(np.where(np.isinf(bend), np.finfo(float).max, bend) / 2))
+        whole = (least * (h * h) * 0.25).hi
+        reach = np.array([whole[:, p : q + 1].max(axis=1) for p, q in zip(first, last, strict=True)]).reshape(len(boxes), -1)
+        inside = Interval(np.clip(z.lo, a[first], a[first + 1]), np.clip(z.hi, a[first], a[first + 1]))
+        part = (inside - a[first]).hi * 1.0, (Interval.exact(a[first + 1]) - inside).hi
+        alone = (least[:, first] * Interval.exact(part[0]) * Interval.exact(part[1])).hi.T
+        total = total + Interval.exact(np.where((first == last)[:, None], np.minimum(alone, reach), reach))
     return total
 
 

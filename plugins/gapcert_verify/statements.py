@@ -8,6 +8,7 @@ from gapcert.plugin import Array, Interval
 
 from .evidence import Evidence, bounds
 
+_APART = 16  # widths
 _HARMLESS = 4  # resolutions: what a spread may be of arithmetic alone
 AT_REST = ", hidden state at its default"
 DRAWN = ", hidden state in equal parts at its default, "
@@ -24,20 +25,26 @@ def held_figures(e: Evidence) -> str:
 
 
 def _figures(e: Evidence, r: Array, low: Interval, high: Interval) -> str:
-    all_gamma = np.maximum(np.abs(low.lo), np.abs(high.hi))
-    gamma, top, gap = all_gamma.mean(axis=0), all_gamma.max(axis=0), np.abs(r).mean(axis=0)
+    ends, gap = abs(low).maximum(abs(high)), np.abs(r).mean(axis=0)
+    # As computed, and padded for rounding, γ may lie some widths of what contains the exact one away: far from 0, over 1e-9.
+    least, most = ends.lo - _APART * ends.width, ends.hi + _APART * ends.width
     for i, name in enumerate(e.data["domain"]["axes"][: e.data["domain"]["states"]]):
-        s = e.data["states"][name]
-        pairs = [("gap_mean", float(gap[i])), ("gamma_mean", float(gamma[i])), ("gamma_max", float(top[i]))]
-        if s["resolved"]:
-            pairs.append(("tightness", float(gamma[i] / gap[i])))
-        for key, value in pairs:
-            if not np.isfinite(value):  # any figure is as near to it as another
-                return f"{name}.{key} is infinite"
-            if not abs(s[key] - value) <= 1e-9 * abs(value) + 1e-300:
-                return f"{name}.{key} is stated as {s[key]:.12g} and follows as {value:.12g}"
+        s, mean = e.data["states"][name], (float(least[:, i].mean()), float(most[:, i].mean()))
         if s["resolved"] != bool(gap[i] >= 10 * e.rounding[i]) or ("tightness" in s) != s["resolved"]:
             return f"{name}.resolved is stated wrongly"
+        pairs = [
+            ("gap_mean", (float(gap[i]),) * 2),
+            ("gamma_mean", mean),
+            ("gamma_max", (float(least[:, i].max()), float(most[:, i].max()))),
+        ]
+        if s["resolved"]:
+            pairs.append(("tightness", (mean[0] / gap[i], mean[1] / gap[i])))
+        for key, (at_least, at_most) in pairs:
+            if not np.isfinite(at_most):  # any figure is as near to it as another
+                return f"{name}.{key} is infinite"
+            spare = 1e-9 * abs(at_most) + 1e-300
+            if not at_least - spare <= s[key] <= at_most + spare:
+                return f"{name}.{key} is stated as {s[key]:.12g} and follows as {at_most:.12g}"
         if s["resolved"] and not s["vacuous"] and not s["gamma_mean"] <= s["constant_bound"] * (1 + 1e-9):
             return f"{name} is vacuous: its mean γ exceeds the constant bound"
     vacuous = any(s["vacuous"] for s in e.data["states"].values())

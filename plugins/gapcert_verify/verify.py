@@ -170,7 +170,7 @@ def _trusted(e: Evidence, source: Origin | str | UsageError) -> list[str]:
         constants = "A calibrated band rests on no constants, but on points that no fit has seen: the run's order is trusted."
     proved = origin["provenance"] == "interval" and whole and e.data["predictor"] != "multilinear"
     told += [
-        (f"{_ONLY}, hidden state, purity and attacks, is as stated: {why}.", not whole),
+        (f"{_ONLY}, how it rounds, hidden state, purity and attacks, is as stated: {why}.", not whole),
         ("How f̂ answered when it was asked again is as stated.", whole and not e.data.get("calibration", {}).get("noise")),
         (f"The number of the audit is {_BOOKED}", True),
         (

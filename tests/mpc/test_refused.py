@@ -40,6 +40,8 @@ def test_a_tube_that_is_wider_than_its_room_is_a_reason(solver: str, mode: str) 
     made = spec.build("controller").synthesize(SynthesisProblem(model, band, domain, spec.goal(domain)))
     assert made.evidence["domain_fraction"] == 0
     assert "reaches the target" in made.evidence["reason"]
+    blamed = made.evidence["reason"].endswith("; for γ = 0 there would be a controller")
+    assert blamed == (mode == "reach"), "in four steps these inputs come around the obstacle for no gap"
 
 
 def held(pull: float, low: float, high: float, **options: Any) -> Mapping[str, Any]:
@@ -58,7 +60,10 @@ def held(pull: float, low: float, high: float, **options: Any) -> Mapping[str, A
     return Mpc(horizon=6, **options).synthesize(SynthesisProblem(model, None, zone, goal)).evidence
 
 
-@pytest.mark.parametrize("options", [{}, {"linearisation": "successive"}], ids=["once", "successive"])
+ENDING = {"terminal": {"kind": "symbolic", "cells": {"x": 20, "v": 40}, "inputs": {"a": 17}}}
+
+
+@pytest.mark.parametrize("options", [{}, {"linearisation": "successive"}, ENDING], ids=["once", "successive", "terminal"])
 @pytest.mark.parametrize("pull", [1.3, 3.1])
 def test_inputs_that_are_too_weak_are_told_with_what_suffices(pull: float, options: dict[str, Any]) -> None:
     told = held(pull, -0.3, 0.3, **options)

@@ -57,6 +57,16 @@ def test_forgeries_are_caught(runs, out, tmp_path, kind):
     assert forged(run_of(runs, kind, out), tmp_path, 11, 12) == []
 
 
+@pytest.mark.exam
+@pytest.mark.parametrize("kind", ["recording", "declared"])
+def test_each_field_and_array_is_held(runs, out, tmp_path, kind):
+    source = run_of(runs, kind, out)
+    target = tmp_path / source.name
+    each = list(Forger(np.random.default_rng(12)).every(source, target))[::6]
+    assert len(each) > 50
+    assert [text for make in each if (text := make().answered(target))] == []
+
+
 def edited(run: Path, name: str, change: Any) -> None:
     data = json.loads((run / name).read_text())
     change(data)
@@ -85,6 +95,22 @@ FORGERIES: dict[str, tuple[str, str, Any, str]] = {
         lambda d: [d[part].update(beta=0.9) for part in ("claim", "audit")],
         "the spec asks for",
     ),
+    "another confidence": ("recording", "spec.json", lambda d: d["certificate"].update(confidence=0.45), "beta is stated as"),
+    "no confidence": ("recording", "spec.json", lambda d: d["certificate"].pop("confidence"), "and the spec asks for None"),
+    "terms of no text": (
+        "engine",
+        "certificate.json",
+        lambda d: d["arithmetic"][0].update(terms=["m*g"]),
+        "or to come of terms, and f̂ is no text",
+    ),
+    "jitter below 0": (
+        "engine",
+        "certificate.json",
+        lambda d: d["arithmetic"][0].update(jitter=[-j for j in d["arithmetic"][0]["jitter"]]),
+        "expected 2 sizes",
+    ),
+    "e of one state": ("engine", "certificate.json", lambda d: d["arithmetic"][0]["e"].pop(), "expected 2 sizes"),
+    "no format": ("declared", "controller/with_gamma/controller.json", lambda d: d.pop("format"), "a format that is not known"),
     "a safety factor": (
         "statistical",
         "certificate.json",

@@ -120,7 +120,7 @@ FORGERIES = {
     "names that are no names": ("relations", {"domain.axes": ["x0", "x1", "u0", "u0"]}, "are no names of 4 axes"),
     "an audit without a digest": ("relations", {"digests.audit-1": None}, "stored without a digest"),
     "an unknown predictor": ("relations", {"predictor": "best"}, "is no predictor"),
-    "no tightness": ("relations", {"states.x0.tightness": None}, "KeyError: 'tightness'"),
+    "no tightness": ("relations", {"states.x0.tightness": None}, "x0.resolved is stated wrongly"),
 }
 
 

@@ -187,7 +187,46 @@ def planned():
     path["next"] = {"x": "x + tau*u", "y": "y + tau*w"}
     cells = {"kind": "symbolic", "cells": {"h": 30, "v": 40}, "inputs": {"a": 7}}
     moves = {"kind": "mpc", "goal": there, "horizon": 14, "searches": 12}
+    led = {
+        "kind": "equations",
+        "states": {"x": "m", "v": "m/s"},
+        "inputs": {"u": "m/s"},
+        "parameters": {"tau": "0.3 s", "s": "1 m/s"},
+    }
+    led |= {"next": {"x": "x + tau*u", "v": "u"}, "period": "0.3 s"}
+    slips = drifting(led, x="0.3*tau*abs(u - v)*(u - v)/s - tau*0.1*(u - v)", v="-0.1*(u - v)")
+    close = {
+        "relations": ["abs(u - v) <= 0.4 m/s"],
+        "coordinates": {"d": "u - v"},
+        "gap": {"kind": "envelope", "predictor": "affine"},
+    }
+    pole = {
+        "kind": "equations",
+        "states": {"q": "rad", "w": "rad/s"},
+        "inputs": {"f": "rad/s^2"},
+        "parameters": {"g": "9 1/s^2"},
+    }
+    pole |= {"derivative": {"q": "w", "w": "f - g*sin(q)"}, "integrator": "euler", "period": "50 ms"}
+    upright = {"q": [-0.6, 0.6], "w": [-2, 2]}
+    lattice = {"gap": {"kind": "multilinear", "predictor": "affine"}, "sampling": {"kind": "lattice", "budget": 300}}
+    lattice |= {"lipschitz": {"residual": {"kind": "interval", "curvature": True}}}
     return {
+        "relative": spec(
+            "relative",
+            led,
+            {"x": [0, 2], "v": [-1, 1], "u": [-1, 1]},
+            {"kind": "mpc", "goal": {"reach_avoid": {"target": {"x": [1.2, 1.8]}}}, "horizon": 8, "searches": 4},
+            backend=slips,
+            **close,
+        ),
+        "bent": spec(
+            "bent",
+            pole,
+            {**upright, "f": [-8, 8]},
+            {"kind": "mpc", "goal": {"invariance": upright}, "horizon": 10, "linearisation": "successive"},
+            backend=drifting(pole, w="0.2*g*q**3 + 0.02*f"),
+            **lattice,
+        ),
         "tracking": spec("tracking", TANK, room, keeps, backend=weak, gap={"kind": "envelope", "predictor": "affine"}),
         "handed": spec("handed", TANK, room, keeps | {"terminal": cells}, gamma={"h": 1e-3, "v": 3e-3}),
         "along": spec("along", TANK, room, keeps | {"linearisation": "successive"}, gamma={"h": 1e-3, "v": 3e-3}),

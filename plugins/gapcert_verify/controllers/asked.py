@@ -34,7 +34,7 @@ class Asked:
     def goal(self) -> Goal:
         """Without the cuts of polytopes, whose texts alone are compared (`cuts`)."""
         given, whole = self.section["goal"], self.states
-        kind = next(k for k in _KINDS if given.get(k) is not None)
+        kind = next((k for k in _KINDS if given.get(k) is not None), "")
         part = given[kind]
         if kind == "invariance":
             return Goal("invariance", self._box(part))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import final
@@ -11,9 +11,9 @@ import numpy as np
 
 from gapcert.plugin import Array, Interval, UsageError, cut, joined, ranges, rounding
 from gapcert_verify import arithmetic as ar
+from gapcert_verify import multilinear
 from gapcert_verify.evaluator import Equations, Reader, Tape
 from gapcert_verify.evidence import Evidence, Part, bounds, factor, written
-from gapcert_verify.multilinear import curvature, nodes
 
 BLOCK = 1 << 20  # samples times boxes that are looked at together
 _EPS = float(np.finfo(np.float64).eps)
@@ -35,25 +35,41 @@ class Gap:
 
     def over(self, low: Array, high: Array) -> Interval:
         """Contains [l(z), u(z)] for all z of boxes (n, nx + nu): (n, nx)."""
-        found = self._over(self._boxes(low, high), Interval(low, high))
+        found = self._over(self.boxes(Interval(low, high)), Interval(low, high))
         return found + Interval(-self._spare, self._spare) if self._spare.any() else found
 
-    def apart(self, low: Array, high: Array) -> tuple[Interval, Array, Array]:
-        """(rest, slope, offset): r ∈ slope z + offset + rest over boxes (n, nz) of (x, u); slope (nx, nz) is that of an affine
-        predictor, whose range would hide over wide boxes how little is left. Of other predictors nothing is taken apart.
+    def beyond(self, y: Interval, z: Interval) -> Interval:
+        """Contains what `affine` leaves of r over boxes y of the stored coordinates, in boxes z of (x, u): (n, nx)."""
+        spare, size = self._spare, np.zeros(self.nx)
+        if self._apart:  # products of the slopes with those of the coordinates round
+            size = np.abs(self.affine[0]) @ z.mag.max(axis=0, initial=0.0)
+        spare = spare + 1e-14 * size
+        return self._over(y, z, known=not self._apart) + Interval(-spare, spare)
+
+    @cached_property
+    def affine(self) -> tuple[Array, Array]:
+        """(slope (nx, nz), offset (nx,)) over (x, u) of an affine predictor, whose range over wide boxes would hide how little
+        is left; 0 of other ones, which are not taken apart.
         """
-        nx, nz, arrays = self.nx, low.shape[1], self.evidence.arrays
-        if self.evidence.data.get("predictor") != "affine" or self.evidence.data["form"]["form"] in _SYMMETRIC:
-            return self.over(low, high), np.zeros((nx, nz)), np.zeros(nx)
-        slope, c = arrays["predictor.slope"], self.relative
+        nz, arrays, c = len(self.evidence.zone.low), self.evidence.arrays, self.relative
+        if not self._apart:
+            return np.zeros((self.nx, nz)), np.zeros(self.nx)
+        slope = np.asarray(arrays["predictor.slope"])
         if c is not None:
-            x, w = slope[:, :nx], slope[:, nx:]
+            x, w = slope[:, : self.nx], slope[:, self.nx :]
             slope = np.concatenate([x + w @ c.slope, w * c.scale], axis=1)
-        # Products of the slopes with those of the coordinates round.
-        size = np.abs(slope) @ np.maximum(np.abs(low), np.abs(high)).max(axis=0)
-        rest = self._over(self._boxes(low, high), Interval(low, high), known=False)
-        spare = self._spare + 1e-14 * size
-        return rest + Interval(-spare, spare), slope, np.asarray(arrays["predictor.offset"])
+        return slope, np.asarray(arrays["predictor.offset"])
+
+    @property
+    def _apart(self) -> bool:
+        return self.evidence.data.get("predictor") == "affine" and self.evidence.data["form"]["form"] not in _SYMMETRIC
+
+    def stored(self, rows: Array) -> Array:
+        """Rows of coefficients of (x, u) as those of the stored coordinates: (n, nz)."""
+        if (c := self.relative) is None:
+            return rows
+        x, u = rows[:, : self.nx], rows[:, self.nx :] / c.scale
+        return np.concatenate([x - u @ c.slope, u], axis=1)
 
     @property
     def nx(self) -> int:
@@ -67,8 +83,9 @@ class Gap:
         own = self.evidence.arrays
         return np.asarray(np.maximum(own["gap.calibrated.widening"], 0.0) + own["gap.calibrated.resolution"])
 
-    def _boxes(self, low: Array, high: Array) -> Interval:
-        return Interval(low, high) if self.relative is None else self.relative.over(Interval(low, high))
+    def boxes(self, z: Interval) -> Interval:
+        """Boxes of the stored coordinates that contain those of (x, u)."""
+        return z if self.relative is None else self.relative.over(z)
 
     def nothing(self, k: int) -> bool:
         """Is there no gap of state k at all, as declared?"""
@@ -81,19 +98,28 @@ class Gap:
 
     @cached_property
     def slopes(self) -> Array | None:
-        """(nx, nz): by how much the ends may move per unit of each coordinate; None where that is not known from constants."""
+        """(nx, nz): by how much residuals, and so about the ends, move per unit of (x, u); None where no constants tell.
+        Nothing but the order in which boxes are cut rests on it.
+        """
+        if (slope := self.left) is None:
+            return None
+        if self.evidence.data.get("predictor") == "affine":
+            slope = slope + np.abs(self.evidence.arrays["predictor.slope"])
+        if (c := self.relative) is None:
+            return slope
+        x, w = slope[:, : self.nx], slope[:, self.nx :]
+        return np.concatenate([x + w @ np.abs(c.slope), w * np.abs(c.scale)], axis=1)
+
+    @cached_property
+    def left(self) -> Array | None:
+        """The same of what the predictor leaves, per unit of the stored coordinates."""
         e = self.evidence
         form, kind, nz = e.data["form"]["form"], e.data.get("predictor", "none"), len(e.zone.low)
         if form == "constant":
             return np.zeros((len(e.arrays["gap.gamma"]), nz))
-        if form != "envelope" or kind not in ("none", "affine"):
+        if "lipschitz" not in e.arrays or kind not in ("none", "affine"):
             return None
-        constants = e.arrays["cells.L"].max(axis=0) if "cells.L" in e.arrays else e.arrays["lipschitz"]
-        slope = constants + (np.abs(e.arrays["predictor.slope"]) if kind == "affine" else 0.0)
-        if (c := self.relative) is None:
-            return np.asarray(slope)
-        x, w = slope[:, : c.slope.shape[1]], slope[:, c.slope.shape[1] :]
-        return np.concatenate([x + w @ np.abs(c.slope), w * np.abs(c.scale)], axis=1)
+        return np.asarray(e.arrays["cells.L"].max(axis=0) if "cells.L" in e.arrays else e.arrays["lipschitz"])
 
     def _over(self, boxes: Interval, asked: Interval, known: bool = True) -> Interval:
         """Of the stored form over boxes in its own coordinates; asked: the same over (x, u). known: with the predictor."""
@@ -115,7 +141,7 @@ class Gap:
             return (boxes.reshape(n, 1, -1) * slope).sum(-1) + Interval.exact(e.arrays["predictor.offset"])
         if kind == "multilinear":
             values = e.arrays["predictor.values"]
-            low, high = ranges(nodes(e.arrays, e.zone, "predictor"), values, boxes.lo, boxes.hi)
+            low, high = ranges(multilinear.nodes(e.arrays, e.zone, "predictor"), values, boxes.lo, boxes.hi)
             pad = rounding(boxes.shape[1]) * np.abs(values).max()
             return Interval(low - pad, high + pad)
         if kind == "model":
@@ -235,43 +261,6 @@ def _dominating(e: Evidence, boxes: Interval) -> Interval:
     return joined(starts, Interval.hull(low, high))
 
 
-def _interpolated(e: Evidence, boxes: Interval) -> Interval:
-    """The range of what lies between the nodes' values, and the most that curvature, or slopes, allow it to miss."""
-    axes = nodes(e.arrays, e.zone, "gap")
-    counts, nx = [len(a) for a in axes], len(e.arrays["resolution"])
-    g = e.parts[0].g[-int(np.prod(counts)) :].reshape(*counts, nx)
-    pad = rounding(len(axes)) * float(g.mag.max())
-    low, high = ranges(axes, g.lo, boxes.lo, boxes.hi)[0] - pad, ranges(axes, g.hi, boxes.lo, boxes.hi)[1] + pad
-    wide = (Interval.exact(e.arrays["remainder.resolution"]) * 2.0 + _missed(e, axes, boxes)).hi
-    return Interval(low, high) + Interval(-wide, wide)
-
-
-def _missed(e: Evidence, axes: Sequence[Array], boxes: Interval) -> Interval:
-    """Σ_j max over the box of min(H_ij / 2, 2 L_ij / h) (z_j − a)(b − z_j); L_ij |z_j − a| along an axis with one node."""
-    constants = e.arrays["lipschitz"]
-    total = Interval.exact(np.zeros((len(boxes), len(constants))))
-    for j, a in enumerate(axes):
-        z = boxes[:, j]
-        beyond = np.maximum(np.maximum(a[0] - z.lo, z.hi - a[-1]), 0.0)
-        total = total + Interval.exact(constants[:, j]) * Interval.around(beyond, 0.0)[:, None]
-        if len(a) < 2:
-            continue
-        # At most h² / 4 of each interval that the box touches, and what the ends allow where it is one alone.
-        first = np.clip(np.searchsorted(a, z.lo, "right") - 1, 0, len(a) - 2)
-        last = np.maximum(np.clip(np.searchsorted(a, z.hi, "left") - 1, 0, len(a) - 2), first)
-        h = Interval.exact(a[1:]) - a[:-1]
-        steep = Interval.exact(2 * constants[:, j : j + 1]) / h
-        bend = curvature(e.arrays, e.zone, j, a)
-        least = steep.minimum(Interval.exact(np.where(np.isinf(bend), np.finfo(float).max, bend) / 2))
-        whole = (least * (h * h) * 0.25).hi
-        reach = np.array([whole[:, p : q + 1].max(axis=1) for p, q in zip(first, last, strict=True)]).reshape(len(boxes), -1)
-        inside = Interval(np.clip(z.lo, a[first], a[first + 1]), np.clip(z.hi, a[first], a[first + 1]))
-        part = (inside - a[first]).hi * 1.0, (Interval.exact(a[first + 1]) - inside).hi
-        alone = (least[:, first] * Interval.exact(part[0]) * Interval.exact(part[1])).hi.T
-        total = total + Interval.exact(np.where((first == last)[:, None], np.minimum(alone, reach), reach))
-    return total
-
-
 _SYMMETRIC: Mapping[str, Callable[[Evidence, Interval], Array]] = {
     "constant": lambda e, boxes: e.arrays["gap.gamma"],
     "basis": _of_basis,
@@ -280,6 +269,6 @@ _SYMMETRIC: Mapping[str, Callable[[Evidence, Interval], Array]] = {
 _BANDS: Mapping[str, Callable[[Evidence, Interval], Interval]] = {
     "envelope": _envelope,
     "dominating": _dominating,
-    "multilinear": _interpolated,
+    "multilinear": lambda e, boxes: multilinear.over(e.arrays, e.zone, e.parts[0].g, boxes),
 }
 """Forms that have γ alone, and those about a predictor."""

@@ -19,8 +19,8 @@ from .successors import Flow, Stored, Windows
 
 PAIRS = 1 << 19  # of a cell and an input, at once
 BATCH = 1 << 12  # pairs that are looked at part by part together
-MOST = 1 << 18  # parts of such a batch, at most
-DEEP = 20  # halvings along each axis, at most
+PARTS = 1 << 14  # of cells, at once
+EACH = 1 << 12  # parts that cells are cut into, on average of a batch, at most
 CORNER = 0.999  # of the way from the middle of a cell to a corner, where a step is tried
 
 
@@ -104,22 +104,19 @@ class Proof:
             row, x, after = bad
             told = f"at {x.tolist()} it leads to {after.tolist()}, where the promise does not hold"
             return f"{self._named(level, rows[row], which[row])}{part.memory}: {told}"
-        pair, (low, high) = np.arange(len(rows)), level.boxes(rows)
-        weight = self._weights(flow, level)
-        for _ in range(DEEP * len(level.axes)):
+        weight, spent, todo = self._weights(flow, level), 0, [(np.arange(len(rows)), *level.boxes(rows))]
+        while todo:
+            pair, low, high = todo.pop()
             wrong = ~self._right(flow, level, height, (low, high), rows[pair], which[pair], limit[pair])
-            if not wrong.any():
-                return ""
             pair, low, high = pair[wrong], low[wrong], high[wrong]
-            if len(pair) > MOST // 2:
-                break
+            if (spent := spent + len(pair)) > EACH * len(rows):
+                return f"{self._named(level, rows[pair[0]], which[pair[0]])}{part.memory}: it was not proved where it leads"
             j, at = np.argmax((high - low) * weight, axis=1), np.arange(len(pair))
-            middle = (low / 2 + high / 2)[at, j]
             below, above = high.copy(), low.copy()
-            below[at, j] = above[at, j] = middle
+            below[at, j] = above[at, j] = (low / 2 + high / 2)[at, j]
             pair, low, high = np.tile(pair, 2), np.concatenate([low, above]), np.concatenate([below, high])
-        first = int(pair[0])
-        return f"{self._named(level, rows[first], which[first])}{part.memory}: it was not proved where it leads"
+            todo += [(pair[a : a + PARTS], low[a : a + PARTS], high[a : a + PARTS]) for a in range(0, len(pair), PARTS)]
+        return ""
 
     def _weights(self, flow: Flow, level: Level) -> Array:
         """(axes,): how many cells the successors move by per unit of each coordinate."""

@@ -9,19 +9,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
-from gapcert.plugin import Array, Box, Interval, Zone
-from gapcert_verify import arithmetic as ar
+from gapcert.plugin import Array, Box, Zone
 from gapcert_verify.evaluator import Equations
 
 from .gap_bounds import Gap
+from .lines import SPARE, Line
 
-MOST = 400_000  # boxes that a stage's bound may be cut into
-BATCH = 1 << 13
-SPARE = 1e-9  # of the frame: far below what a solver may miss a row by, which is counted as disturbance
 DEFECT = 1e-8  # of products that are to be the identity, or to be equal
 
 
@@ -56,8 +53,9 @@ class Plans:
         for relation, a, b in zip(self.zone.relations, self.zone.matrix, self.zone.bounds, strict=True):
             own = a * half
             size = np.abs(own).max()
-            same = (np.abs(C - own / size) <= 1e-9).all(axis=1) & (top <= (b - a @ middle) / size + 1e-9)
-            if not same.any():
+            room = (b - a @ middle) / size + 1e-9
+            same = (np.abs(C - own / size) <= 1e-9).all(axis=1) & (top <= room)
+            if not same.any() and np.abs(own / size).sum() > room:  # the box itself may keep it
                 return f"{relation.text} is no row of its programs"
         if (self.arrays["reference"].shape, float(self.arrays["tolerance"]) > 0) != (low.shape, True):
             return "its reference or its tolerance are none"
@@ -85,90 +83,12 @@ class Plans:
             seen.append(list(one.values()))
             if not self.successive and (np.abs(one["low"] + 1).max() > SPARE or np.abs(one["high"] - 1).max() > SPARE):
                 return f"stage {k} is bounded on a part of the box alone"
-            if text := self._stage(k, one):
+            if not (np.isfinite(one["c"]) & (one["c"] >= 0)).all() or not (one["G"] >= 0).all():
+                return f"stage {k}: its bounds are negative or not finite"
+            frame = self.arrays["frame.middle"], self.arrays["frame.half"]
+            if text := Line(one, frame, self.features, self.zone, self.model, self.gap).proved(k):
                 return text
         return ""
-
-    def _stage(self, k: int, s: Mapping[str, Array]) -> str:
-        """Boxes are halved where the largest |w| may exceed what is counted, along what it depends on most."""
-        line = np.concatenate([s["A"], s["B"]], axis=1)
-        if not (np.isfinite(s["c"]) & (s["c"] >= 0)).all() or not (s["G"] >= 0).all():
-            return f"stage {k}: its bounds are negative or not finite"
-        boxes = [np.concatenate([s["low"][None], s["high"][None]])[:, None]]
-        spent = 0
-        while boxes:
-            low, high = boxes.pop()
-            spent += len(low)
-            if spent > MOST:
-                return f"stage {k}: that its bounds hold was not proved with {MOST:,} boxes"
-            inside = ~self._outside(low, high)
-            low, high = low[inside], high[inside]
-            if not len(low):
-                continue
-            left, weight = self._left_out(low, high, line, s["d"])
-            room = s["c"] + self._distance(low - s["centre"], high - s["centre"]) @ s["G"].T + SPARE
-            wrong = ~((left.hi <= room) & (-left.lo <= room)).all(axis=1)
-            low, high = low[wrong], high[wrong]
-            if not len(low):
-                continue
-            if (text := self._refuted(k, low, high, line, s)) is not None:
-                return text
-            j, at = np.argmax((high - low) * (weight[wrong] + 1e-12), axis=1), np.arange(len(low))
-            middle = (low / 2 + high / 2)[at, j]
-            below, above = high.copy(), low.copy()
-            below[at, j] = above[at, j] = middle
-            parts = np.concatenate([low, above]), np.concatenate([below, high])
-            boxes += [np.stack([p[a : a + BATCH] for p in parts]) for a in range(0, len(parts[0]), BATCH)]
-        return ""
-
-    def _refuted(self, k: int, low: Array, high: Array, line: Array, s: Mapping[str, Array]) -> str | None:
-        """A point at which more is left out for certain."""
-        z = low / 2 + high / 2
-        left, _ = self._left_out(z, z, line, s["d"])
-        room = s["c"] + np.abs((z - s["centre"]) @ self.features.T) @ s["G"].T
-        over = np.maximum(left.lo, -left.hi) > room + 2 * SPARE
-        if not over.any():
-            return None
-        row, i = np.argwhere(over)[0]
-        at = (self.arrays["frame.middle"] + self.arrays["frame.half"] * z[row]).tolist()
-        return f"stage {k}: at {at} state {i} goes farther from the line than the tube counts"
-
-    def _left_out(self, low: Array, high: Array, line: Array, d: Array) -> tuple[Interval, Array]:
-        """(w, weight): what the line and an offset leave out over boxes of the frame, (n, nx), and how much each axis matters.
-
-        By the mean-value theorem about the boxes' middles: F(z) − line(z) at c, and (F′ − line)(z − c).
-        """
-        middle, half, nx = Interval.exact(self.arrays["frame.middle"]), self.arrays["frame.half"], len(d)
-        box = middle + Interval(low, high) * Interval.exact(half)
-        c = low / 2 + high / 2
-        at = middle + Interval.exact(c) * Interval.exact(half)
-        rest, slope, offset = self.gap.apart(box.lo, box.hi)
-        reach = Interval.around(0.0, np.maximum(high - c, c - low))
-        out, weight = list[Interval](), np.zeros_like(low)
-        for k in range(nx):
-            f = ar.known(self.model.over(at.lo, at.hi, self.model.terms[k]))
-            J = ar.known(self.model.slopes(box.lo, box.hi, self.model.terms[k]))
-            p = (at * Interval.exact(slope[k])).sum(-1) + float(offset[k])
-            value = (Interval(*f) + p - float(self.arrays["frame.middle"][k])) / float(half[k])
-            straight = (Interval.exact(c) * Interval.exact(line[k])).sum(-1) + float(d[k])
-            bent = (Interval(*J) + Interval.exact(slope[k])) * Interval.exact(half) / float(half[k]) - Interval.exact(line[k])
-            out.append(value - straight + (bent * reach).sum(-1) + rest[:, k] / float(half[k]))
-            mag = np.nan_to_num(bent.mag, nan=1e6, posinf=1e6)
-            if self.gap.slopes is not None:
-                mag = mag + self.gap.slopes[k] * half / half[k]
-            weight = np.maximum(weight, mag)
-        return Interval.stack(out, axis=1), weight
-
-    def _distance(self, low: Array, high: Array) -> Array:
-        """(n, f): the least |F z| over boxes."""
-        F = self.features
-        ends = (Interval(low, high)[:, None, :] * Interval.exact(F)).sum(-1)
-        return np.asarray(abs(ends).lo)
-
-    def _outside(self, low: Array, high: Array) -> Any:
-        """(n,): a box meets no point that the relations leave, for certain."""
-        middle, half = Interval.exact(self.arrays["frame.middle"]), Interval.exact(self.arrays["frame.half"])
-        return self.zone.outside(middle + Interval(low, high) * half)
 
     def sections(self) -> str:
         """P H = 1, Λ H = H (A + BK) of the first stage, and as much of another one: so |H e| ≤ s stays within |Λ| s."""

@@ -191,6 +191,8 @@ class Saved:
             _ = asked.goal
         except OSError as error:
             return f"{error.filename}: {error.strerror}"
+        except KeyError as error:
+            return f"the spec's goal has no {error}"
         return asked
 
     @cached_property
@@ -319,17 +321,20 @@ class Saved:
 
     @property
     def _zone(self) -> Zone:
-        """The certificate's domain over (x, u): relations of what is measured relative to the states are written out."""
+        """The certificate's domain over (x, u): what is said of inputs that are relative to the states is written out."""
         zone, flow = self.evidence.zone, self._flow
         relative = flow.gap.relative if isinstance(flow, Flow) and flow.gap is not None else None
         if relative is None:
             return zone
         c, d, nx = relative.slope, relative.scale, relative.slope.shape[1]
-        moved = [
-            Relation(r.text, tuple((np.concatenate([a[:nx] + a[nx:] @ c, a[nx:] * d])).tolist()), r.bound)
-            for r, a in zip(zone.relations, zone.matrix, strict=True)
-        ]
-        return Zone(zone.low, zone.high, tuple(moved))
+        names, w = self.evidence.data["domain"]["axes"][nx:], np.eye(len(zone.low))[nx:]
+        rows = [(r.text, a, r.bound) for r, a in zip(zone.relations, zone.matrix, strict=True)]
+        rows += [(f"{n} <= {b:g}", a, b) for n, a, b in zip(names, w, zone.high[nx:], strict=True)]
+        rows += [(f"{n} >= {b:g}", -a, -b) for n, a, b in zip(names, w, zone.low[nx:], strict=True)]
+        moved = (Relation(t, (*(a[:nx] + a[nx:] @ c).tolist(), *(a[nx:] * d).tolist()), b) for t, a, b in rows)
+        ranges = [self.stored["domain"][n] for n in flow.model.inputs]
+        low, high = ([quantity(given[k])[k] for given in ranges] for k in (0, 1))
+        return Zone((*zone.low[:nx], *low), (*zone.high[:nx], *high), tuple(moved))
 
     def _horizon(self) -> str | None:
         asked = self._asked_for
@@ -346,13 +351,7 @@ class Saved:
         flow = self._flow
         if isinstance(flow, str) or flow.gap is None:
             return None
-        zone = self._zone
-        if flow.gap.relative is not None:
-            ends = [self.stored["domain"][n] for n in flow.model.inputs]
-            low, high = (tuple(quantity(e[k])[k] for e in ends) for k in (0, 1))
-            nx = flow.model.nx
-            zone = Zone((*zone.low[:nx], *low), (*zone.high[:nx], *high), zone.relations)
-        return check(Plans(self.arrays, Goal.from_data(self.data["goal"]).stay, zone, flow.model, flow.gap))
+        return check(Plans(self.arrays, Goal.from_data(self.data["goal"]).stay, self._zone, flow.model, flow.gap))
 
     def _ends(self) -> str | None:
         """Around a steady pair; or in cells that win, of a controller that is proved as any other on cells is."""

@@ -21,7 +21,9 @@ from .gap_bounds import Gap
 
 ENTRIES = 1 << 22  # of a table that is kept
 BOXES = 40_000  # over which [l, u] is bounded at first
-PIECES = 16  # of a state without cells
+PIECES = 16  # of a state without cells, at first
+HALVED = 400_000  # of these, at most
+CLOSE = 1 / 32  # of a cell: to which [l, u] is then known; of a state without cells a 16th of that
 
 
 @final
@@ -109,14 +111,15 @@ class Spread:
     def on(self, k: int) -> set[int]:
         """The coordinates along which that of state k varies."""
         ends = [end[:, k].reshape(self.counts) for end in (self.low, self.high)]
-        return {j for j, n in enumerate(self.counts) if n > 1 and any((np.ptp(e, axis=j) > 0).any() for e in ends)}
+        with np.errstate(invalid="ignore"):  # of boxes beyond Z nothing is known
+            return {j for j, n in enumerate(self.counts) if n > 1 and any((np.ptp(e, axis=j) > 0).any() for e in ends)}
 
 
 def spread(flow: Flow, level: Level) -> Spread | None:
     """Of a level: over blocks that are the finer along a coordinate the more the gap changes there."""
     if flow.gap is None:
         return None
-    nx, ends = len(level.axes), list[tuple[Array, Array]]()
+    ends = list[tuple[Array, Array]]()
     held = [a.count == 1 for a in level.axes]
     for a, alone in zip(level.axes, held, strict=True):
         edges = np.linspace(a.edges[0], a.edges[-1], PIECES + 1) if alone else a.edges
@@ -126,17 +129,48 @@ def spread(flow: Flow, level: Level) -> Spread | None:
     starts = [np.arange(n) * len(low) // n for n, (low, _) in zip(counts, ends, strict=True)]
     parts = [(low[s], high[np.append(s[1:], len(low)) - 1]) for s, (low, high) in zip(starts, ends, strict=True)]
     boxes = [np.stack([m.ravel() for m in np.meshgrid(*side, indexing="ij")], axis=1) for side in zip(*parts, strict=True)]
-    found = [flow.gap.over(*(b[a : a + 4096] for b in boxes)) for a in range(0, len(boxes[0]), 4096)]
-    low = np.concatenate([r.lo for r in found]).reshape(*counts, nx)
-    high = np.concatenate([r.hi for r in found]).reshape(*counts, nx)
     # A state without cells is anywhere in its box.
     along = tuple(j for j, alone in enumerate(held) if alone)
-    low, high = low.min(axis=along, keepdims=True), high.max(axis=along, keepdims=True)
+    block = np.arange(math.prod(counts)).reshape(counts)
+    block = np.broadcast_to(block.min(axis=along, keepdims=True), counts).ravel()
+    low, high = _hulls(flow.gap, level, boxes[0], boxes[1], block, along)
     own = [
         np.zeros(1, dtype=np.int64) if j in along else np.searchsorted(s, np.arange(len(e[0])), "right") - 1
         for j, (s, e) in enumerate(zip(starts, ends, strict=True))
     ]
-    return Spread(low.reshape(-1, nx), high.reshape(-1, nx), own, low.shape[:-1])
+    return Spread(low, high, own, tuple(1 if j in along else n for j, n in enumerate(counts)))
+
+
+def _hulls(gap: Gap, level: Level, low: Array, high: Array, block: Ints, along: tuple[int, ...]) -> tuple[Array, Array]:
+    """The least l and the largest u of each block, (blocks, nx) each, in the blocks' order.
+
+    Boxes that may have more than is known from middles are halved along states without cells, which every successor depends on.
+    """
+    names, of = np.unique(block, return_inverse=True)
+    ends, seen = (np.full((2, len(names), len(level.axes)), -np.inf) for _ in range(2))
+    near = np.array([a.width * (CLOSE / 16 if a.count == 1 else CLOSE) for a in level.axes])
+    left = HALVED if along else 0
+    while len(low):
+        found, c = _bounds(gap, low, high), low / 2 + high / 2
+        for k, value in enumerate(_bounds(gap, c, c) if left > 0 else found):
+            np.maximum.at(seen[k], of, value)
+        wide = (found > seen[:, of] + near).any(axis=(0, 2))
+        left -= int(wide.sum())
+        wide &= left > 0
+        for k in range(2):
+            np.maximum.at(ends[k], of[~wide], found[k][~wide])
+        low, high, of, row = low[wide], high[wide], of[wide], np.arange(wide.sum())
+        j = np.array(along, dtype=np.int64)[np.argmax((high - low)[:, along], axis=1)] if len(row) else row
+        below, above = high.copy(), low.copy()
+        below[row, j] = above[row, j] = (low / 2 + high / 2)[row, j]
+        low, high, of = np.concatenate([low, above]), np.concatenate([below, high]), np.tile(of, 2)
+    return -ends[0], ends[1]
+
+
+def _bounds(gap: Gap, low: Array, high: Array) -> Array:
+    """(−l, u) over boxes, (2, n, nx)."""
+    found = [gap.over(low[a : a + 4096], high[a : a + 4096]) for a in range(0, len(low), 4096)]
+    return np.stack([np.concatenate([-r.lo for r in found]), np.concatenate([r.hi for r in found])])
 
 
 def _shares(flow: Flow, level: Level, most: Sequence[int], widths: Array) -> list[int]:

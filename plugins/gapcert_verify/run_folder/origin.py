@@ -183,8 +183,12 @@ def question(e: Evidence, o: Origin) -> str:
 def _level(e: Evidence, o: Origin) -> str:
     r, data = o.request, e.data
     if (audit := data.get("audit")) is None:
-        epsilon = data["claim"].get("epsilon", r.epsilon)
-        return "" if epsilon == r.epsilon else f"ε is stated as {epsilon}, and the spec asks for {r.epsilon}"
+        # A recording's claim has a confidence where one is written, and none by default.
+        written = o.build.spec.config.certificate
+        beta = r.beta if written is not None and "confidence" in written.model_fields_set else None
+        asked = {"epsilon": r.epsilon, "beta": beta} if "recording" in data else {}
+        name = next((k for k, v in asked.items() if data["claim"].get(k) != v), "")
+        return name and f"{name} is stated as {data['claim'].get(name)}, and the spec asks for {asked[name]}"
     stated = {
         "violation": (audit["epsilon"], r.epsilon),
         "1 − confidence": (audit["beta"], r.beta),
@@ -353,15 +357,15 @@ def arithmetic(e: Evidence, o: Origin) -> str | None:
         return None
     if (stated := e.data.get("arithmetic")) is None:
         return "how e is known is left out"
+    seen, nx = stated[0].get("jitter"), o.domain.nx
+    if any(sizes is not None and (len(sizes) != nx or min(sizes) < 0) for sizes in (seen, stated[0]["e"])):
+        return f"e of f̂ is stated as {stated[0]['e']}, its jitter as {seen}; expected {nx} sizes"
     if o.whole:
-        seen = stated[0].get("jitter")
-        if seen is not None and len(seen) != o.domain.nx:
-            return f"{len(seen)} states are said to jitter, of {o.domain.nx}"
         made = [a.to_data() for a in o.residual.arithmetic(o.domain, None if seen is None else np.array(seen))]
     else:
         made = [stated[0], Residual(o.model, o.model).arithmetic(o.domain)[1].to_data()]
-        if stated[0]["proved"] and o.build.spec.component("backend").kind != "model":
-            return "e of f̂ is said to be proved, and f̂ is no text"
+        if (stated[0]["proved"] or stated[0]["terms"] != []) and o.build.spec.component("backend").kind != "model":
+            return "e of f̂ is said to be proved, or to come of terms, and f̂ is no text"
     if not _alike(made, stated):
         return f"e is stated as {stated}, and follows as {made}"
     total = np.array(stated[0]["e"]) + np.array(stated[1]["e"])
