@@ -109,6 +109,7 @@ def _slopes(arrays: Arrays, zone: Zone, axes: Sequence[Array], g: Interval, boxe
     constants, bends = arrays["lipschitz"], list[Interval]()
     for j, a in enumerate(axes):
         most, z = np.tile(constants[:, j], (len(boxes), 1)), boxes[:, j]
+        bends.append(Interval(-most, most))
         if len(a) > 1:
             k = np.clip(np.searchsorted(a, z.lo, "right") - 1, 0, len(a) - 2)
             alone = (z.lo >= a[k]) & (z.hi <= a[k + 1])
@@ -117,8 +118,7 @@ def _slopes(arrays: Arrays, zone: Zone, axes: Sequence[Array], g: Interval, boxe
             least = (Interval.exact(2 * constants[:, j : j + 1]) / h).minimum(Interval.exact(bend / 2))
             turned = least[:, k] * (Interval.exact(a[k]) + a[k + 1] - z * 2.0)
             most = np.maximum(most, (least * h).hi.max(axis=1))
-            most = Interval(np.where(alone, turned.lo, -most.T).T, np.where(alone, turned.hi, most.T).T)
-        bends.append(most if isinstance(most, Interval) else Interval(-most, most))
+            bends[j] = Interval(np.where(alone, turned.lo, -most.T).T, np.where(alone, turned.hi, most.T).T)
     low, high = slopes(axes, g.mid, boxes.lo, boxes.hi)
     least_h = np.array([np.diff(a).min(initial=np.inf) for a in axes])
     pad = 2 * (float(g.rad.max()) + 2 * rounding(len(axes)) * float(g.mag.max())) / least_h

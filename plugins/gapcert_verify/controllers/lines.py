@@ -103,9 +103,9 @@ class Line:
         z = self._inputs(Interval.exact(y))[0].mid
         z = z[(z >= self.box.lo).all(axis=1) & (z <= self.box.hi).all(axis=1) & self.zone.related(z)]
         exact = Interval.exact(z)
-        y = self.gap.boxes(exact)
-        left = self._model(exact)[0] + self.gap.beyond(y, exact) / Interval.exact(self.half[: self.nx])
-        room = self.c + abs(self._into(exact) - self.centre).hi @ self.along.T + self._across(y).hi
+        own = self.gap.boxes(exact)
+        left = self._model(exact)[0] + self.gap.beyond(own, exact) / Interval.exact(self.half[: self.nx])
+        room = self.c + abs(self._into(exact) - self.centre).hi @ self.along.T + self._across(own).hi
         over = np.argwhere(np.maximum(left.lo, -left.hi) > room + 2 * SPARE)
         if not len(over):
             return ""

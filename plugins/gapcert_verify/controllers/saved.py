@@ -323,8 +323,7 @@ class Saved:
     def _zone(self) -> Zone:
         """The certificate's domain over (x, u): what is said of inputs that are relative to the states is written out."""
         zone, flow = self.evidence.zone, self._flow
-        relative = flow.gap.relative if isinstance(flow, Flow) and flow.gap is not None else None
-        if relative is None:
+        if not isinstance(flow, Flow) or flow.gap is None or (relative := flow.gap.relative) is None:
             return zone
         c, d, nx = relative.slope, relative.scale, relative.slope.shape[1]
         names, w = self.evidence.data["domain"]["axes"][nx:], np.eye(len(zone.low))[nx:]
