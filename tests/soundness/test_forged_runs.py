@@ -110,7 +110,6 @@ FORGERIES: dict[str, tuple[str, str, Any, str]] = {
         "expected 2 sizes",
     ),
     "e of one state": ("engine", "certificate.json", lambda d: d["arithmetic"][0]["e"].pop(), "expected 2 sizes"),
-    "no format": ("declared", "controller/with_gamma/controller.json", lambda d: d.pop("format"), "a format that is not known"),
     "a safety factor": (
         "statistical",
         "certificate.json",

@@ -159,8 +159,7 @@ def _controlled(e: Evidence, told: Mapping[str, Any]) -> str:
     made, stated = controllers(e), told.get("controller")
     if len(made) < 2:
         return "a controller is told of, and none is stored" if stated else ""
-    unsaid = 1 if e.older else None
-    if any((read(e, f"controller/{name}/controller.json") or {}).get("format", unsaid) != 1 for name in made):
+    if any((read(e, f"controller/{name}/controller.json") or {}).get("format", 1) != 1 for name in made):
         return "a controller is of a format that is not known"
     careful, trusting = made["with_gamma"], made["without_gamma"]
     kind = e.data["claim"]["kind"]
