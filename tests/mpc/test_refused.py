@@ -26,8 +26,10 @@ def test_so_do_hundreds_of_drawn_ones() -> None:
     assert 20 < endings.count("nothing") < len(endings) - 20
 
 
-@pytest.mark.parametrize("solver", ["osqp", "piqp", "clarabel"])
-@pytest.mark.parametrize("mode", ["reach", "around"])
+AROUND = pytest.param("piqp", "around", marks=pytest.mark.exam)
+
+
+@pytest.mark.parametrize(("solver", "mode"), [*((s, "reach") for s in ("osqp", "piqp", "clarabel")), AROUND])
 def test_a_tube_that_is_wider_than_its_room_is_a_reason(solver: str, mode: str) -> None:
     """Its rows then ask for more than they allow, which no library takes."""
     data = drawn(MODES.index(mode))
@@ -63,8 +65,11 @@ def held(pull: float, low: float, high: float, **options: Any) -> Mapping[str, A
 ENDING = {"terminal": {"kind": "symbolic", "cells": {"x": 20, "v": 40}, "inputs": {"a": 17}}}
 
 
-@pytest.mark.parametrize("options", [{}, {"linearisation": "successive"}, ENDING], ids=["once", "successive", "terminal"])
-@pytest.mark.parametrize("pull", [1.3, 3.1])
+@pytest.mark.parametrize(
+    ("pull", "options"),
+    [(1.3, {}), (3.1, {}), (3.1, {"linearisation": "successive"}), pytest.param(1.3, ENDING, marks=pytest.mark.exam)],
+    ids=str,
+)
 def test_inputs_that_are_too_weak_are_told_with_what_suffices(pull: float, options: dict[str, Any]) -> None:
     told = held(pull, -0.3, 0.3, **options)
     assert told["domain_fraction"] == 0

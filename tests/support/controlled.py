@@ -223,7 +223,7 @@ def planned():
             "bent",
             pole,
             {**upright, "f": [-8, 8]},
-            {"kind": "mpc", "goal": {"invariance": upright}, "horizon": 10, "linearisation": "successive"},
+            {"kind": "mpc", "goal": {"invariance": upright}, "horizon": 2, "linearisation": "successive"},
             backend=drifting(pole, w="0.2*g*q**3 + 0.02*f"),
             **lattice,
         ),
