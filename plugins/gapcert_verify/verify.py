@@ -424,7 +424,8 @@ def _audit(e: Evidence) -> str:
     if not certain <= stated <= possible:
         return f"{certain} points lie outside for certain; {stated} were stated"
     least = int((np.abs(r) > np.maximum(np.abs(low.lo), np.abs(high.hi))).any(axis=1).sum())
-    return "" if least <= above <= stated else f"|r| > γ at {least} points for certain; {above} were stated"
+    most = min(stated, int((np.abs(r) > abs(low).maximum(abs(high)).lo - slack).any(axis=1).sum()))
+    return "" if least <= above <= most else f"|r| > γ at {least} points for certain, at {most} at most; {above} were stated"
 
 
 def _witnessed(e: Evidence, low: Interval, high: Interval) -> str:

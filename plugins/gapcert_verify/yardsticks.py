@@ -31,7 +31,7 @@ def yardsticks(e: Evidence) -> str | None:
         s = e.data["states"][name]
         if s["safety_factor"] != safety:
             return f"{name}.safety_factor is stated as {s['safety_factor']}, and that of the constants is {safety}"
-        if made is not None and not abs(s["constant_bound"] - made[i]) <= 1e-6 * made[i]:
+        if made is not None and not _near(s["constant_bound"], made[i], 1e-6 * made[i]):
             return f"{name}.constant_bound is stated as {s['constant_bound']:.6g}, and follows as {made[i]:.6g}"
         if made is None and (text := _bracketed(e, i, s["constant_bound"])):
             return f"{name}.constant_bound: {text}"
@@ -40,12 +40,17 @@ def yardsticks(e: Evidence) -> str | None:
         known = s.get("envelope_mean")
         if known is None and mean is not None:
             return f"{name}.envelope_mean is left out"
-        if known is not None and mean is not None and not abs(known - mean[i]) <= 1e-9 * mean[i] + 4 * e.rounding[i]:
+        if known is not None and mean is not None and not _near(known, mean[i], 1e-9 * mean[i] + 4 * e.rounding[i]):
             return f"{name}.envelope_mean is stated as {known:.9g}, and follows as {mean[i]:.9g}"
         ratio = s.get("tightness_vs_envelope")
         if ratio is not None and not abs(ratio - s["gamma_mean"] / known) <= 1e-9 * ratio:
             return f"{name}.tightness_vs_envelope is no ratio of the means"
     return ""
+
+
+def _near(a: float, b: float, within: float) -> bool:
+    """Also where both are infinite, as an envelope over unbounded constants is."""
+    return a == b or abs(a - b) <= within < np.inf
 
 
 def _constants(e: Evidence) -> Array | None:

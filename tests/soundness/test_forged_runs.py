@@ -97,6 +97,12 @@ FORGERIES: dict[str, tuple[str, str, Any, str]] = {
     ),
     "another confidence": ("recording", "spec.json", lambda d: d["certificate"].update(confidence=0.45), "beta is stated as"),
     "no confidence": ("recording", "spec.json", lambda d: d["certificate"].pop("confidence"), "and the spec asks for None"),
+    "more above γ": (
+        "calibrated",
+        "certificate.json",
+        lambda d: d["audit"].update(gamma_violations=d["audit"]["gamma_violations"] + 1, violations=d["audit"]["violations"]),
+        "|r| > γ at",
+    ),
     "terms of no text": (
         "engine",
         "certificate.json",
