@@ -103,6 +103,8 @@ FORGERIES: dict[str, tuple[str, str, Any, str]] = {
         lambda d: d["audit"].update(gamma_violations=d["audit"]["gamma_violations"] + 1, violations=d["audit"]["violations"]),
         "|r| > γ at",
     ),
+    "no predictor": ("statistical", "spec.json", lambda d: d["gap"].update(predictor="none"), "and the spec asks for none"),
+    "a predictor": ("related", "spec.json", lambda d: d["gap"].pop("predictor"), "and the spec asks for affine"),
     "terms of no text": (
         "engine",
         "certificate.json",

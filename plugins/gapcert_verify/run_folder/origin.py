@@ -308,6 +308,9 @@ def predicted(e: Evidence, o: Origin) -> str | None:
         return f"{kind!r} is no predictor"
     if kind == "model" and not isinstance(o.asked["predictor"], Model):
         return "the predictor is stated as a model, and the spec names none"
+    family = getattr(o.asked["family"], "predictor", None)
+    if family is not None and kind != (asked := _kind(family, o)):
+        return f"the predictor is stated as {kind}, and the spec asks for {asked}"
     if kind == "none" and any(np.any(e.arrays.get(f"predictor.{k}", 0.0)) for k in ("offset", "slope")):
         return "a predictor is stored, and none is stated"
     if "remainder.resolution" not in e.arrays:
@@ -324,6 +327,11 @@ def predicted(e: Evidence, o: Origin) -> str | None:
             if stored.shape != own.shape or not (np.abs(own - stored) <= 2 * e_p + 4 * np.spacing(np.abs(own))).all():
                 return f"predictor.{name} is not what the predictor gives"
     return _affine(e) if kind == "affine" == o.asked["family"].predictor else ""
+
+
+def _kind(family: Any, o: Origin) -> str:
+    """Of the predictor that a family with that option subtracts; what is made of samples is no text."""
+    return "model" if isinstance(o.asked["predictor"], Model) else family if isinstance(family, str) else "multilinear"
 
 
 def _calibrated(e: Evidence) -> Array:
