@@ -29,7 +29,7 @@ def inside(arrays, zone, g, found, z):
 @pytest.mark.parametrize("counts", [(4,), (1, 6), (3, 2, 5)])
 def test_a_band_over_boxes_holds_at_points_of_them(counts):
     rng = np.random.default_rng([7, *counts])
-    for _ in range(8):
+    for _ in range(5):
         arrays, zone, g = drawn(rng, counts, 2)
         low, width = (np.array(end) for end in (zone.low, np.subtract(zone.high, zone.low)))
         share = rng.uniform(0, 0.8, (200, 2, len(counts))) * rng.choice([1e-3, 0.1, 1.0], (200, 1, 1))
