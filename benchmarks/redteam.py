@@ -7,7 +7,7 @@
 Kinds are the modules of `attacks`. Deterministic claims may not break at all. Of a statistical one (ε, β) the share of violated
 points, drawn as its audit draws, may be significantly above ε (one-sided binomial test, 1e-3) in no more claims than β allows
 (0.99 quantile of a binomial distribution). Claim k of a seed is always the same. Each is kept as a line of JSON with
-the commit that it was asked of, and asked again at another one. An attempt that ends in neither claim nor reason is an error,
+the commit that it was asked of, and asked again at another one. An attempt without claim or reason is an error,
 and so is an honest run that `verify` refuses.
 """
 

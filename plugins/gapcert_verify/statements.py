@@ -8,14 +8,14 @@ from gapcert.plugin import Array, Interval
 
 from .evidence import Evidence, bounds
 
-_APART = 16  # widths
+_APART = 16  # widths: what stored functions are padded by is a few times what is known of them here
 _HARMLESS = 4  # resolutions: what a spread may be of arithmetic alone
 AT_REST = ", hidden state at its default"
 DRAWN = ", hidden state in equal parts at its default, "
 
 
 def figures(e: Evidence) -> str:
-    """Means over the audit's points agree with what is stated, to 1e-9 relative; tightness is their ratio."""
+    """Means over the audit's points, and their ratio, tightness, are as stated, to 1e-9 and what rounding leaves open."""
     return _figures(e, e.audit[1], *e.audited)
 
 

@@ -109,7 +109,7 @@ FORGERIES: dict[str, tuple[str, str, Any, str]] = {
         "engine",
         "certificate.json",
         lambda d: d["arithmetic"][0].update(terms=["m*g"]),
-        "or to come of terms, and f̂ is no text",
+        "or has terms, but f̂ has no equations",
     ),
     "jitter below 0": (
         "engine",

@@ -49,8 +49,11 @@ def test_a_band_over_boxes_holds_at_points_of_them(counts):
 
 def test_without_the_slopes_of_what_is_missed_it_would_not_hold(monkeypatch):
     rng, missed = np.random.default_rng(4), 0
-    between = lambda arrays, zone, axes, g, boxes: (Interval.exact(np.zeros((len(boxes), 2, 1))),) * 2  # noqa: E731
-    monkeypatch.setattr(multilinear, "_slopes", between)
+
+    def flat(arrays, zone, axes, g, boxes):
+        return (Interval.exact(np.zeros((len(boxes), 2, 1))),) * 2
+
+    monkeypatch.setattr(multilinear, "_slopes", flat)
     for _ in range(8):
         arrays, zone, g = drawn(rng, (5,), 2)
         a = rng.uniform(zone.low[0], zone.high[0], (200, 1))

@@ -150,6 +150,13 @@ def plans(run):
     return found[0]
 
 
+def test_no_plan_is_made_where_no_gap_is_known(runs):
+    p = plans(runs["bent"])
+    assert p.framed() == ""
+    low, high = ((0.9 * ends[0], *ends[1:]) for ends in (p.zone.low, p.zone.high))
+    assert "beyond the certificate's domain" in replace(p, zone=replace(p.zone, low=low, high=high)).framed()
+
+
 @pytest.mark.parametrize("name", ["bent", *(pytest.param(name, marks=pytest.mark.exam) for name in ("tracking", "relative"))])
 def test_what_is_left_out_is_bounded_where_nobody_looked(runs, name):
     """Where less than the stored bound is asked for, some boxes are no longer proved; what is proved holds at random points."""

@@ -14,7 +14,7 @@ from gapcert_verify.evaluator import Equations
 from .gap_bounds import Gap
 
 MOST = 400_000  # boxes that a stage's bound may be cut into
-BATCH = 1 << 13
+BATCH = 1 << 13  # of them at once, which a cache holds
 SHRUNK = 64  # boxes over which slopes are averaged
 SPARE = 1e-9  # of the frame: far below what a solver may miss a row by, which is counted as disturbance
 
@@ -43,7 +43,10 @@ class Line:
     def proved(self, k: int) -> str:
         """ "" where it is; boxes are halved where the largest |w| may exceed what is counted, along what it depends on most."""
         whole = self.gap.boxes(self.box)
-        low, high = np.maximum(whole.lo, self.gap.evidence.zone.low), np.minimum(whole.hi, self.gap.evidence.zone.high)
+        # What inputs beyond their stored range mean is no question: relations of Z keep them out.
+        low, high = whole.lo.copy(), whole.hi.copy()
+        low[:, self.nx :] = np.maximum(low[:, self.nx :], self.gap.evidence.zone.low[self.nx :])
+        high[:, self.nx :] = np.minimum(high[:, self.nx :], self.gap.evidence.zone.high[self.nx :])
         boxes, spent, least = [(low, high)], 0, 1e-12 / np.maximum(high - low, 1e-300)
         while boxes:
             low, high = boxes.pop()
@@ -91,12 +94,14 @@ class Line:
 
         F(z) − F(ẑ) = J̄ (z − ẑ) with J̄ in the mean of F′ over the box shrunk to m/M about ẑ, m = 1 … M.
         """
-        z = Interval.exact(self.centre)
-        begin = self._model(self._out(z[None]))[0][0]
+        z = Interval.exact(self._out(Interval.exact(self.centre[None])).mid)
+        begin = self._model(z)[0][0]
         if not ((ends.lo <= self.centre) & (self.centre <= ends.hi)).all():
             return begin, np.full(self.line.shape, np.inf)
-        shrunk = z + (ends - self.centre) * ((np.arange(SHRUNK) + 1) / SHRUNK)[:, None]
-        return begin, (self._model(self._out(shrunk))[1].sum(0) / float(SHRUNK)).mag
+        shrunk = z + Interval.hull(self.box - z, 0.0) * ((np.arange(SHRUNK) + 1) / SHRUNK)[:, None]
+        steep = (self._model(shrunk)[1].sum(0) / float(SHRUNK)).mag
+        # z is ẑ as near as floats are.
+        return begin + Interval.around(0.0, steep @ abs(self._into(z) - self.centre).hi[0]), steep
 
     def _refuted(self, y: Array) -> str:
         """Points at which more is left out for certain."""
@@ -129,7 +134,7 @@ class Line:
     def _across(self, y: Interval) -> Interval:
         """Contains Σ_f G_f |F_f (z − ẑ)| of the features that are no axes, (n, nx); F of y rounds far below SPARE."""
         at = self.gap.boxes(self._out(Interval.exact(self.centre[None])))
-        far = abs(((y - at.mid)[:, None] * Interval.exact(self.features)).sum(-1))
+        far = abs(((y - at)[:, None] * Interval.exact(self.features)).sum(-1))
         return Interval(far.lo @ self.across.T, far.hi @ self.across.T)
 
     def _inputs(self, y: Interval) -> tuple[Interval, Any]:

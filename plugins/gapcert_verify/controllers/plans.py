@@ -49,6 +49,8 @@ class Plans:
         spare = 1e-12 * (high - low)
         if (np.abs(middle - half - low) > spare).any() or (np.abs(middle + half - high) > spare).any():
             return "its frame is not the box of the goal and of the inputs"
+        if (low < np.asarray(self.zone.low) - spare).any() or (high > np.asarray(self.zone.high) + spare).any():
+            return "its frame reaches beyond the certificate's domain, where no gap is known"
         C, top = self.arrays["rows.C"], self.arrays["rows.high"]
         for relation, a, b in zip(self.zone.relations, self.zone.matrix, self.zone.bounds, strict=True):
             own = a * half

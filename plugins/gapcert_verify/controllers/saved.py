@@ -321,7 +321,7 @@ class Saved:
 
     @property
     def _zone(self) -> Zone:
-        """The certificate's domain over (x, u): what is said of inputs that are relative to the states is written out."""
+        """The certificate's domain over (x, u), with ranges of relative inputs as relations."""
         zone, flow = self.evidence.zone, self._flow
         if not isinstance(flow, Flow) or flow.gap is None or (relative := flow.gap.relative) is None:
             return zone

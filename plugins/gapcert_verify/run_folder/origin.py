@@ -186,7 +186,7 @@ def _level(e: Evidence, o: Origin) -> str:
         # A recording's claim has a confidence where one is written, and none by default.
         written = o.build.spec.config.certificate
         beta = r.beta if written is not None and "confidence" in written.model_fields_set else None
-        asked = {"epsilon": r.epsilon, "beta": beta} if "recording" in data else {}
+        asked = {"epsilon": r.epsilon, "beta": beta} if "recording" in data else dict.fromkeys(("epsilon", "beta"))
         name = next((k for k, v in asked.items() if data["claim"].get(k) != v), "")
         return name and f"{name} is stated as {data['claim'].get(name)}, and the spec asks for {asked[name]}"
     stated = {
@@ -373,7 +373,7 @@ def arithmetic(e: Evidence, o: Origin) -> str | None:
     else:
         made = [stated[0], Residual(o.model, o.model).arithmetic(o.domain)[1].to_data()]
         if (stated[0]["proved"] or stated[0]["terms"] != []) and o.build.spec.component("backend").kind != "model":
-            return "e of f̂ is said to be proved, or to come of terms, and f̂ is no text"
+            return "e of f̂ is stated as proved, or has terms, but f̂ has no equations"
     if not _alike(made, stated):
         return f"e is stated as {stated}, and follows as {made}"
     total = np.array(stated[0]["e"]) + np.array(stated[1]["e"])
