@@ -61,8 +61,9 @@ class AutomatonController(Controller):
 
     def _value(self, x: Array, memory: Ints) -> Ints:
         """(n,): the value of the part that the memory names, −1 outside."""
-        values = np.stack([part.value(x) for part in self.parts])[np.maximum(memory, 0), np.arange(len(x))]
-        return np.where(memory >= 0, values, -1)
+        cell = self.parts[0].cells(x)
+        values = np.stack([part.values[cell] for part in self.parts])[np.maximum(memory, 0), np.arange(len(cell))]
+        return np.where((memory >= 0) & (cell >= 0), values, -1)
 
     def value(self, x: Array) -> Ints:
         """(n,): the steps until the automaton accepts, at most, of runs that begin at x; −1 outside the domain."""
@@ -87,11 +88,7 @@ class AutomatonController(Controller):
         return self.automaton.advance(memory, np.where(cell >= 0, sure, letter))
 
     def keeps(self, x: Array, memory: Ints) -> Bools:
-        out = np.zeros(len(x), dtype=bool)
-        for q, part in enumerate(self.parts):
-            rows = np.flatnonzero(memory == q)
-            out[rows] = part.contains(x[rows]) if rows.size else False
-        return out
+        return np.asarray(self._value(x, memory) >= 0)
 
     def contains(self, x: Array) -> Bools:
         x = np.atleast_2d(np.asarray(x, dtype=np.float64))

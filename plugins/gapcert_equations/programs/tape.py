@@ -45,13 +45,15 @@ class Tape:
 def _run(table: Table, values: list[Any], code: tuple[Instruction, ...]) -> list[Any]:
     append = values.append
     for name, slots, literals in code:
-        if literals:
-            append(table[name](*[values[s] for s in slots], *literals))
-        elif len(slots) == 2:
-            # Nearly all are of this kind; a general call costs as much as the arithmetic on few rows.
-            append(table[name](values[slots[0]], values[slots[1]]))
+        function = table[name]
+        # Nearly all are of the first two kinds; a general call costs as much as the arithmetic on few rows.
+        if len(slots) == 2 and not literals:
+            i, j = slots
+            append(function(values[i], values[j]))
+        elif len(slots) == 1 and not literals:
+            append(function(values[slots[0]]))
         else:
-            append(table[name](*[values[s] for s in slots]))
+            append(function(*[values[s] for s in slots], *literals))
     return values
 
 
