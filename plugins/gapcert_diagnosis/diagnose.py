@@ -18,6 +18,7 @@ from gapcert_recordings import JITTER, Copies, repairs
 
 from .data.consistency import agreeing, doubt, kept_within, ordered
 from .data.dataset import Dataset, Windows
+from .data.defaults import last_quarter, usual_horizons
 from .experiment import Limits, told_apart
 from .figure import figure
 from .fitting.fit import Fit, fit
@@ -40,7 +41,7 @@ def diagnose(
     *,
     hold_out: Mapping[str, Any] | None = None,
     train: Mapping[str, Any] | None = None,
-    horizons: Sequence[float] = (0.5,),
+    horizons: Sequence[float] | None = None,
     window: float | None = None,
     experiment: Mapping[str, Any] | None = None,
     seed: int = 0,
@@ -51,14 +52,16 @@ def diagnose(
 
     Measured outputs are compared with simulated ones over windows whose start is free. A cause is named when its fall in score
     pays for its parameters and for the number of rivals, and when a later stretch of the data agrees. The gain is measured by
-    free rollouts over `hold_out` (default: the last quarter), which no fit has seen, at the given horizons in s. experiment:
-    what an experiment may do that tells apart what these data do not: `limits` of inputs and outputs, `seconds`. train: the
+    free rollouts over `hold_out` (default: the last quarter), which no fit has seen, at horizons in s (default: of one turn of
+    the motion, and of three). experiment: what an experiment may do that tells apart what these data do not: `limits` of inputs
+    and outputs, `seconds`. train: the
     trajectories that are fitted. A model for which there is a `diagnoser`, such as an engine in contact, which is rolled out
     itself, is left to that; folder: keeps what an interrupted search goes on with.
     """
     clock = Clock(emit)
     _timed(model, recording, horizons)
-    parts, copies = _once(recording, hold_out or {"last": 0.25}, train, [s.name for s in model.inputs])
+    parts, copies = _once(recording, hold_out or last_quarter(recording), train, [s.name for s in model.inputs])
+    horizons = usual_horizons(recording, parts[1], [s.name for s in model.outputs]) if horizons is None else horizons
     more = experiment or {}
     if copies.found:
         clock.emit(Event("warning", "recording", {"message": copies.told}))
@@ -275,12 +278,12 @@ def _effects(effects: Sequence[Effect | str] | Literal["all"]) -> list[Effect]:
     return found
 
 
-def _timed(model: Model, recording: Recording, horizons: Sequence[float]) -> None:
+def _timed(model: Model, recording: Recording, horizons: Sequence[float] | None) -> None:
     """Refuses rows in no order, no horizon, and one below a sample: as a rule times in another unit than they are read in."""
     ordered(recording)
-    if not horizons:
-        raise UsageError("diagnose: no horizon is given; name at least one in seconds, such as [0.5]")
-    period, shortest = recording.period, min(horizons)
+    if horizons is not None and not horizons:
+        raise UsageError("diagnose: no horizon is given; name at least one in seconds, such as [0.5], or leave them out")
+    period, shortest = recording.period, min(horizons or [0.0])
     if 0 < shortest < (1 - JITTER) * period:
         raise UsageError(
             f"diagnose.horizons: {shortest:g} s is shorter than {period:.6g} s, the period of the recording; expected at least "

@@ -107,9 +107,15 @@ class DiagnoseConfig(Section):
     """
 
     effects: Literal["all"] | list[str] = Field("all", description="names of effects that may be blamed, or all")
-    hold_out: HoldOut = Field(description="data that take no part in the fit, on which the answer is judged")
+    hold_out: HoldOut | None = Field(
+        None, description="data that take no part in the fit, on which the answer is judged; default: the last quarter"
+    )
     train: Chosen | None = Field(None, description="trajectories that are fitted; default: all that are not held out")
-    horizons: list[Seconds] = Field(min_length=1, description="lengths of rollouts; the longest is quoted")
+    horizons: list[Seconds] | None = Field(
+        default=None,
+        min_length=1,
+        description="lengths of rollouts; the longest is quoted; default: in how long the motion turns once, and three times",
+    )
     window: Seconds | None = Field(None, description="length of the stretches that are fitted; default: chosen from the data")
     experiment: ExperimentConfig | None = Field(
         None, description="what may be asked of the real system where these data cannot decide"

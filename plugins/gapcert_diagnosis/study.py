@@ -54,14 +54,14 @@ class DiagnosisStudy(Study):
             if against is not None and c.controller is not None:
                 build.make("controller").check(model, against[1], build.spec.goal(against[1]))
         with stages.stage("diagnosis"):
-            hold_out = asked.hold_out.model_dump(exclude_none=True, by_alias=True)
+            held = asked.hold_out
             found = diagnose(
                 seen,
                 recording,
                 asked.effects,
-                hold_out=hold_out,
+                hold_out=None if held is None else held.model_dump(exclude_none=True, by_alias=True),
                 train=None if asked.train is None else asked.train.model_dump(exclude_none=True),
-                horizons=tuple(asked.horizons),
+                horizons=None if asked.horizons is None else tuple(asked.horizons),
                 window=asked.window,
                 experiment=None if asked.experiment is None else asked.experiment.model_dump(),
                 seed=c.seed,

@@ -43,6 +43,7 @@ class FileReader(gc.plugin.Reader):
             return self.place(titled.get(table, self.folder), row)
 
         shared: dict[str, Any] = {"columns": c.columns, "units": c.units, "hold": c.hold, "every": c.every, "place": place}
+        shared["units_in_names"] = type(self).units_in_names
         if not isinstance(c, Table):
             return gc.Recording.from_columns(found, time=TIME, **{**shared, "units": {**c.units, TIME: "ns"}})
         if c.period is None:

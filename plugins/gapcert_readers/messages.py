@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, ClassVar, final
 
 import numpy as np
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 import gapcert as gc
 from gapcert import Array
@@ -20,11 +20,14 @@ from .files import TIME, Columns, FileReader, told
 
 Message = tuple[str, int, Any]  # topic, time of logging in ns, content
 _STEP = re.compile(r"\.?([^.\[\]]+)|\[([^\]]+)\]")
+_METADATA = "metadata.yaml"
 NAMES = ("name", "names", "joint_names")  # the list beside an array that names its elements
 
 
 class MessageReader(FileReader):
     """A Recording from messages."""
+
+    units_in_names: ClassVar = False
 
     def from_file(self, path: Path, title: str) -> Sequence[tuple[str, Columns]]:
         """One trajectory: all columns at the times of the first one's topic."""
@@ -55,14 +58,16 @@ class MessageReader(FileReader):
 
     @classmethod
     def tables(cls, path: Path, title: str | None = None) -> Sequence[tuple[str, Columns]]:
-        """One table per topic that has numbers."""
+        """One table per topic that has numbers, and one without columns of each that nothing can be read of."""
         series: dict[str, _Series] = {}
         with told(title or path.name, cls.form):
             for topic, at, content in cls.messages(path, None):
-                series.setdefault(topic, _Series()).add(_stamp(content, at), content)
-        out = []
+                series.setdefault(topic, _Series()).add(at if content is None else _stamp(content, at), content)
+        out: list[tuple[str, Columns]] = []
         for topic, one in series.items():
-            if fields := one.fields():
+            if one.contents[0] is None:
+                out.append((f"{topic}, which cannot be decoded", {}))
+            elif fields := one.fields():
                 out.append(
                     (topic, {TIME: (np.array(one.times) - one.times[0]) / 1e9, **{topic + f: one.column(f) for f in fields}})
                 )
@@ -76,7 +81,7 @@ class MessageReader(FileReader):
     @classmethod
     @abstractmethod
     def messages(cls, path: Path, topics: set[str] | None) -> Iterator[Message]:
-        """Of some topics, or of all that can be decoded."""
+        """Of some topics, which have to be decoded, or of all, with None for what cannot be."""
 
 
 @final
@@ -189,10 +194,10 @@ class McapReader(MessageReader):
             for schema, channel, message in make_reader(file).iter_messages(topics=list(topics) if topics else None):
                 if channel.id not in decoders:
                     decoders[channel.id] = _decoder(channel.message_encoding, schema)
-                if (decode := decoders[channel.id]) is not None:
-                    yield channel.topic, message.log_time, decode(message.data)
-                elif topics is not None:
-                    raise ValueError(f"topic '{channel.topic}' is encoded as '{channel.message_encoding}'")
+                if (decode := decoders[channel.id]) is None and topics is not None:
+                    what = f"is encoded as '{channel.message_encoding}' by '{getattr(schema, 'name', '')}'"
+                    raise ValueError(f"topic '{channel.topic}' {what}, which is no message")
+                yield channel.topic, message.log_time, decode and decode(message.data)
 
 
 def _decoder(encoding: str, schema: Any) -> Callable[[bytes], Any] | None:
@@ -202,7 +207,10 @@ def _decoder(encoding: str, schema: Any) -> Callable[[bytes], Any] | None:
         return None
     store = get_typestore(Stores.EMPTY)
     name = schema.name if schema.name.count("/") == 2 else schema.name.replace("/", "/msg/", 1)
-    store.register(get_types_from_msg(schema.data.decode(), name))
+    try:
+        store.register(get_types_from_msg(schema.data.decode(), name))
+    except TypesysError:  # a service or an action, say
+        return None
     read = store.deserialize_cdr if encoding == "cdr" else store.deserialize_ros1
     return lambda data: read(data, name)
 
@@ -212,7 +220,7 @@ class Rosbag2Reader(MessageReader):
     """Messages of ROS 2 bags, whatever stores them."""
 
     form = "a ROS 2 bag, a folder with metadata.yaml"
-    suffixes: ClassVar = ("",)
+    suffixes: ClassVar = ("", ".db3")
 
     @classmethod
     def topics(cls, path: Path) -> Sequence[str]:
@@ -226,16 +234,30 @@ class Rosbag2Reader(MessageReader):
         with _bag(path) as bag:
             chosen = [c for c in bag.connections if topics is None or c.topic in topics]
             for connection, at, data in bag.messages(connections=chosen):
-                yield connection.topic, at, bag.deserialize(data, connection.msgtype)
+                try:
+                    content = bag.deserialize(data, connection.msgtype)
+                except (KeyError, TypesysError):
+                    if topics is not None:
+                        what = f"topic '{connection.topic}' has '{connection.msgtype}'"
+                        raise ValueError(f"{what}, which the bag does not define") from None
+                    content = None
+                yield connection.topic, at, content
 
     @classmethod
     def tables(cls, path: Path, title: str | None = None) -> Sequence[tuple[str, Columns]]:
         """One table per topic; none where the folder is no bag."""
-        return super().tables(path, title) if (path / "metadata.yaml").is_file() else ()
+        stored = path.is_file() or any(p.suffix in (".db3", ".mcap") for p in path.iterdir())
+        return super().tables(path, title) if stored or (path / _METADATA).is_file() else ()
 
 
 def _bag(path: Path) -> Any:
+    """The bag of a folder, or of a file in it."""
     from rosbags.highlevel import AnyReader
 
+    folder = path if path.is_dir() else path.parent
+    if not (folder / _METADATA).is_file():
+        what = f"recording: {path.name} cannot be read: there is no {_METADATA} beside what is stored"
+        other = "; kind: mcap reads an .mcap file without one" if any(folder.glob("*.mcap")) else ""
+        raise gc.UsageError(f"{what}; expected {Rosbag2Reader.form}; `ros2 bag reindex {folder}` writes it{other}")
     # Bags of older distributions do not carry their definitions.
-    return AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
+    return AnyReader([folder], default_typestore=get_typestore(Stores.LATEST))

@@ -10,6 +10,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import gapcert as gc
 from gapcert_readers.thresholds import THRESHOLDS
 
@@ -17,6 +19,8 @@ MARKS = ",;\t "
 LARGEST = 2**31 - 1  # bytes of a block: what decides on the type of a column
 _COMMA = r"^\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*$"
 _GROUPED = r"^\s*[+-]?[1-9]\d{0,2}(,\d{3})+\s*$"
+_CLOCK = r"^\s*\d{1,2}:\d\d:\d\d([.,]\d+)?\s*$"
+_DAY = 86400.0  # s
 
 
 def separated(path: Path) -> Any:
@@ -25,40 +29,53 @@ def separated(path: Path) -> Any:
     with path.open("rb") as file:
         if file.read(2) in (b"\xff\xfe", b"\xfe\xff"):
             raise gc.UsageError(f"recording: {path.name} is in UTF-16; expected text in UTF-8; save it as `CSV UTF-8`")
-    lines, above = _lines(path), remarks(path)
-    mark = mark_of(lines)
-    _headed(path, lines, mark)
+    above, mark = layout(path)
+    _headed(path, _lines(path, above), mark)
     if above:
         # Arrow would count the columns by what is said there, or skip rows, of which empty lines are none.
         data = io.BytesIO(path.read_bytes().split(b"\n", above)[-1])
     if mark == " ":
         # Several blanks are one: columns of numbers are often lined up.
         text = data.getvalue() if above else path.read_bytes()
+        text = re.sub(rb"^[#%] *", b"", text)
         data = io.BytesIO(re.sub(rb"(?m)^ +| +(?=\r?$)", b"", re.sub(rb" +", b" ", text)))
     table = _parsed(data, path, mark, ".")
     commas = [n for n in table.column_names if mark != "," and _any(table[n], _COMMA)]
     if commas:
         table = _with_commas(data, path, mark, table, commas)
-    names = [n.strip() for n in table.column_names]
-    return table.rename_columns(names) if len(set(names)) == len(names) else table
+    return _with_clocks(table)
 
 
-def mark_of(lines: Sequence[str]) -> str:
-    """What stands between the values: the mark that splits the header and the first row into equally many, and most."""
-    head = lines[:2]
-    counts = {mark: {len(_split(line, mark)) for line in head} for mark in MARKS}
-    fitting = {mark: max(n) for mark, n in counts.items() if len(n) == 1 and max(n) > 1}
-    # Blanks stand beside other marks too.
-    if len(fitting) > 1:
-        fitting.pop(" ", None)
-    return max(fitting, key=lambda mark: fitting[mark], default=",")
+def layout(path: Path) -> tuple[int, str]:
+    """(how many lines stand above the header, what stands between the values).
+
+    The header and the lines below it have as many values as most lines have, by the mark that finds it first, and then by the
+    one that makes the most values; blanks stand beside other marks too. Lines that begin with # or % are remarks; the last one
+    is the header where numbers follow it.
+    """
+    lines = [(n, line.strip("\r\n")) for n, line in enumerate(_text(path, THRESHOLDS.preamble_lines)) if line.strip()]
+    first = next((i for i, (_, line) in enumerate(lines) if not _remark(line)), len(lines))
+    headed = first > 0 and first < len(lines) and re.match(r"\s*[-+.\d]", lines[first][1])
+    lines = lines[first - 1 if headed else first :]
+    found = []
+    for mark in MARKS:
+        counts = [len(_split(_bare(line), mark)) for _, line in lines]
+        usual = max(counts, key=counts.count, default=1)
+        starts = [i for i in range(len(counts) - 1) if set(counts[i : i + 3]) == {usual}]
+        if usual > 1 and starts:
+            found.append((mark == " ", starts[0], -usual, mark))
+    if not found:
+        return lines[0][0] if lines else 0, ","
+    _, start, _, mark = min(found)
+    return lines[start][0], mark
 
 
 def _headed(path: Path, lines: Sequence[str], mark: str) -> None:
     """UsageError where the first line has values in place of names, or the second has units in place of values."""
+    cells = [cell.strip() for cell in _split(lines[0], mark)] if lines else []
     names, *rows = ([_kind(cell) for cell in _split(line, mark)] for line in lines)
     where = f"recording: {path.name}"
-    if names and set(names) <= {"number", "whole"} and "number" in names:
+    if names and set(names) <= {"number", "whole"} and ("number" in names or len(set(cells)) < len(cells)):
         what = f"the first line has numbers ('{lines[0][:60]}')"
         raise gc.UsageError(f"{where}: {what}; expected a header; put a line with the names of the columns above")
     if len(rows) > 1 and "text" in rows[0] and set(rows[0]) <= {"text", "none"}:
@@ -83,32 +100,34 @@ def _kind(cell: str) -> str:
 
 def line_of(path: Path, row: int) -> int:
     """The number of the line, from 1, where a row, from 0, stands below the header; lines that are empty hold none."""
-    above = remarks(path)
+    above = layout(path)[0]
     with open(path, encoding="utf-8", errors="replace", newline=None) as file:
         full = (n for n, line in enumerate(file, 1) if n > above and line.strip("\r\n"))
         return next(itertools.islice(full, row + 1, None), row + 2)
 
 
-def remarks(path: Path) -> int:
-    """How many lines that begin with # or % stand above the header, which is the first without, and holds names."""
-    for n, line in enumerate(itertools.islice(_text(path), THRESHOLDS.preamble_lines)):
-        if line.strip() and not line.lstrip().startswith(("#", "%")):
-            # Where numbers follow, the last remark is the header.
-            return 0 if re.match(r"\s*[-+.\d]", line) else n
-    return 0
-
-
-def _lines(path: Path) -> list[str]:
+def _lines(path: Path, above: int) -> list[str]:
     """The header and the first two rows."""
-    below = itertools.islice(_text(path), remarks(path), None)
-    return list(itertools.islice((line.rstrip("\r\n") for line in below if line.strip("\r\n")), 3))
+    below = itertools.islice(_text(path), above, None)
+    return [_bare(line) for line in itertools.islice((line.rstrip("\r\n") for line in below if line.strip("\r\n")), 3)]
 
 
-def _text(path: Path) -> Iterator[str]:
-    """Lines of a file that may be anything."""
+def _text(path: Path, most: int | None = None) -> Iterator[str]:
+    """Lines of a file that may be anything, at most so many."""
     with open(path, encoding="utf-8-sig", errors="replace") as file:
-        while line := file.readline(1 << 20):
+        for _ in itertools.count() if most is None else range(most):
+            if not (line := file.readline(1 << 20)):
+                return
             yield line
+
+
+def _remark(line: str) -> bool:
+    return line.lstrip().startswith(("#", "%"))
+
+
+def _bare(line: str) -> str:
+    """Without the sign of a remark, as headers have it that NumPy writes."""
+    return re.sub(r"^\s*[#%]+\s*", "", line)
 
 
 def _split(line: str, mark: str) -> list[str]:
@@ -117,6 +136,7 @@ def _split(line: str, mark: str) -> list[str]:
 
 def _parsed(data: Any, path: Path, mark: str, decimal: str) -> Any:
     """Read by Arrow, which sees the type of a column in its first block: the whole file where a later one disagrees."""
+    import pyarrow
     from pyarrow import ArrowInvalid
     from pyarrow import csv as arrow
 
@@ -126,7 +146,14 @@ def _parsed(data: Any, path: Path, mark: str, decimal: str) -> Any:
     def read(**options: Any) -> Any:
         if data is not path:
             data.seek(0)
-        return arrow.read_csv(data, arrow.ReadOptions(**options), parse, convert)
+        table = arrow.read_csv(data, arrow.ReadOptions(**options), parse, convert)
+        if _undecoded(table) and "encoding" not in options:
+            # Loggers and spreadsheets that do not know UTF-8 write ° and µ as single bytes.
+            return read(encoding="latin-1", **options)
+        named = [_bare(n).strip() for n in table.column_names]
+        # A mark at the end of each line makes a column of nothing.
+        kept = [i for i, n in enumerate(named) if n or not pyarrow.types.is_null(table.column(i).type)]
+        return table.select(kept).rename_columns(_distinct([named[i] or f"column {i + 1}" for i in kept]))
 
     def whole(**options: Any) -> Any:
         try:
@@ -137,13 +164,30 @@ def _parsed(data: Any, path: Path, mark: str, decimal: str) -> Any:
             return read(block_size=min(max(path.stat().st_size, 1) + 1, LARGEST), **options)
 
     try:
-        table = whole()
-        # Loggers and spreadsheets that do not know UTF-8 write ° and µ as single bytes.
-        return whole(encoding="latin-1") if _undecoded(table) else table
+        return whole()
     except ArrowInvalid as error:
         if re.search(r"Expected \d+ columns, got \d+", str(error)):
             raise _uneven(path, mark) or error from None
         raise
+
+
+def _distinct(names: Sequence[str]) -> list[str]:
+    """Names that several columns have are numbered: `y (1)`, `y (2)`."""
+    return [f"{n} ({names[: i + 1].count(n)})" if names.count(n) > 1 else n for i, n in enumerate(names)]
+
+
+def _with_clocks(table: Any) -> Any:
+    """With times of day, such as 10:11:12.5, in seconds, which go on past midnight."""
+    import pyarrow
+
+    for i, name in enumerate(table.column_names):
+        column = table.column(i)
+        if pyarrow.types.is_time(column.type) or _all(column, _CLOCK):
+            parts = [None if v is None else str(v).strip().replace(",", ".").split(":") for v in column.to_pylist()]
+            t = np.array([np.nan if not p or p == [""] else float(p[0]) * 3600 + float(p[1]) * 60 + float(p[2]) for p in parts])
+            days = np.cumsum(np.diff(t, prepend=t[:1]) < -_DAY / 2)
+            table = table.set_column(i, name, pyarrow.array(t + _DAY * days))
+    return table
 
 
 def _undecoded(table: Any) -> bool:
@@ -158,7 +202,7 @@ def _undecoded(table: Any) -> bool:
 
 def _uneven(path: Path, mark: str) -> gc.UsageError | None:
     """The first line that has another number of values than the header."""
-    above, names = remarks(path), 0
+    above, names = layout(path)[0], 0
     for n, line in enumerate(_text(path), 1):
         if n > above and (text := line.rstrip("\r\n")):
             count = len(_split(text, mark))
@@ -178,6 +222,13 @@ def _any(column: Any, pattern: str) -> bool:
 
     text = pyarrow.types.is_string(column.type)
     return text and bool(compute.any(compute.match_substring_regex(column, pattern)).as_py())
+
+
+def _all(column: Any, pattern: str) -> bool:
+    """Does a column of text have values of this form alone, and empty ones?"""
+    from pyarrow import compute
+
+    return _any(column, pattern) and bool(compute.all(compute.match_substring_regex(column, rf"{pattern}|^\s*$")).as_py())
 
 
 def _with_commas(data: Any, path: Path, mark: str, points: Any, names: Sequence[str]) -> Any:

@@ -55,11 +55,12 @@ def flat(table: Any) -> dict[str, Any]:
 class CsvReader(TableReader):
     """Text with one header line and a row per line; commas, semicolons, tabs or blanks stand between the values.
 
-    A comma may be the decimal sign where it does not stand between values; a file has one decimal sign.
+    A comma may be the decimal sign where it does not stand between values; a file has one decimal sign. What stands above the
+    header is passed over, a header behind # is one, times of day are in seconds, and columns of one name are numbered.
     """
 
     form = "values separated by commas, semicolons or tabs, below a header"
-    suffixes: ClassVar = (".csv",)
+    suffixes: ClassVar = (".csv", ".txt", ".dat", ".tsv")
 
     @classmethod
     def arrow(cls, path: Path) -> Any:
@@ -92,6 +93,7 @@ class LerobotReader(FileReader):
 
     form = "a LeRobot data set, a folder with meta/info.json and data/"
     suffixes: ClassVar = ("",)
+    units_in_names: ClassVar = False
 
     def from_file(self, path: Path, title: str) -> Sequence[tuple[str, Columns]]:
         """One table of all episodes that are asked for."""

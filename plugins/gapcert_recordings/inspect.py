@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, final
 
@@ -36,6 +35,11 @@ class Column:
     noise: float | None = None
     step: float | None = None
     unit: str = ""
+
+    @property
+    def title(self) -> str:
+        """The name with the unit, which it may end in."""
+        return f"{self.name} [{self.unit}]" if self.unit and not stated_units([self.name]) else self.name
 
     def facts(self) -> dict[str, Any]:
         """As plain data."""
@@ -87,7 +91,7 @@ def inspect(path: Path | str) -> tuple[Table, ...]:
         return tuple(_described(tr.name, "t", tr.t, tr.channels, recording.units) for tr in recording.trajectories)
     readers = _readers(where)
     for reader in readers:
-        if found := [_table(name, columns, partial(reader.place, where)) for name, columns in reader.tables(where)]:
+        if found := [_table(reader, where, name, columns) for name, columns in reader.tables(where)]:
             return tuple(found)
     raise UsageError(f"{path}: nothing in it is a table of numbers; expected a log; `gapcert plugins` lists the readers")
 
@@ -121,18 +125,23 @@ def _readers(path: Path) -> list[type[Reader]]:
     return found
 
 
-def _table(name: str, columns: Mapping[str, Any], place: Callable[[int], str]) -> Table:
+def _table(reader: type[Reader], path: Path, name: str, columns: Mapping[str, Any]) -> Table:
     given = {harmless(n): np.asarray(v) for n, v in columns.items() if np.ndim(v) == 1}
     found = {n: v if v.dtype.kind in "fiubM" else as_numbers(v) for n, v in given.items() if v.dtype.kind in "fiubMOUST"}
     every = {n: v for n, v in found.items() if v is not None}
     text = {n: first_text(given[n]) or (0, "") for n, v in found.items() if v is None}
     length = max(map(len, every.values()), default=0)
-    time = next((n for n in every if _stated(n)[0] in TIMES and len(every[n]) == length), None)
+    dates = [n for n, v in every.items() if v.dtype.kind == "M"]
+    time = next((n for n in [*filter(_is_time, every), *dates] if len(every[n]) == length), None)
     counted = np.arange(length, dtype=np.float64)
     t = seconds(name, time, every[time], _stated(time)[1] or _unit(every[time])) if time else counted
     rest = {n: v.astype(np.float64) for n, v in every.items() if v.dtype.kind != "M" and n != time and len(v) == length}
-    told = {n: (place(row), value) for n, (row, value) in text.items()}
-    return replace(_described(name, time, t, rest, stated_units(rest)), text=told)
+    told = {n: (reader.place(path, row), value) for n, (row, value) in text.items()}
+    return replace(_described(name, time, t, rest, stated_units(rest) if reader.units_in_names else {}), text=told)
+
+
+def _is_time(column: str) -> bool:
+    return _stated(column)[0].strip("_") in TIMES
 
 
 def _stated(column: str) -> tuple[str, str]:
@@ -197,7 +206,7 @@ def in_words(tables: Sequence[Table]) -> list[str]:
         lines.append(f"{table.name}: {sentence(table)}")
         head = ("column", "least", "greatest", "deviation", "noise floor", "step", "missing", "outliers")
         rows = [
-            (_titled(c), *map(_number, (c.low, c.high, c.spread, c.noise, c.step)), c.missing or "", c.outliers or "")
+            (c.title, *map(_number, (c.low, c.high, c.spread, c.noise, c.step)), c.missing or "", c.outliers or "")
             for c in table.columns
         ]
         lines += [f"  {line}" for line in columns(head, rows)] if rows else []
@@ -227,10 +236,6 @@ def sentence(table: Table) -> str:
         (log.duplicates, f"{log.duplicates} rows whose time does not go forward"),
     ]
     return "; ".join([text, *(words for true, words in said if true)])
-
-
-def _titled(c: Column) -> str:
-    return f"{c.name} [{c.unit}]" if c.unit else c.name
 
 
 def _number(value: float | None) -> str:

@@ -228,7 +228,7 @@ def _either(first: Array, second: Array, a: Slopes, b: Slopes) -> Slopes:
     return out
 
 
-_QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\d\s.+-].*?|1\s*/.*?)?\s*")
+_QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\d\s.+-].*?|1\s*/.*?|(?<=\s)1)?\s*")
 # Pint computes powers of numbers while it reads: only a name or a bracket may have an exponent, a short one.
 _POWER = re.compile(r"(?<=[^\W\d_]|[)%°])\s*(?:\*\*|\^)\s*\(?-?\d{1,2}(?:[./]\d)?\)?(?!\s*(?:\*\*|[\^\w.]))")
 _PLAIN = re.compile(r"(?:1(?=\s*/))?(?:[^\W\d_]|[%°/() .-]|\*(?!\*)){0,60}")

@@ -183,7 +183,7 @@ def test_no_experiment_for_what_is_the_same_under_every_input():
     [
         (
             {"horizons": [60.0]},
-            r"a horizon of 60 s does not fit the held-out data: 0.3 s serve to find a start and 3.7 s are left",
+            r"a horizon of 60 s does not fit the held-out data: 0.08 s serve to find a start and 3.92 s are left",
         ),
         ({"horizons": []}, r"no horizon is given"),
         ({"horizons": [-1.0]}, r"expected a positive horizon"),

@@ -28,11 +28,16 @@ class Stretches:
 
     @classmethod
     def of(cls, held: Dataset, horizon: float, lead: float = THRESHOLDS.rollout_leads[-1]) -> Stretches:
-        """`lead` in s."""
-        length, lead = held.samples(horizon), max(THRESHOLDS.lead_samples, held.samples(lead))
-        longest = max(len(y) - held.first(i) for i, y in enumerate(held.outputs)) - lead - length
+        """`lead` in s, or less where the held-out data leave less beside the horizon."""
+        length, least = held.samples(horizon), THRESHOLDS.lead_samples
+        room = max(len(y) - held.first(i) for i, y in enumerate(held.outputs)) - length
+        lead = max(least, min(held.samples(lead), room))
+        longest = room - lead
         if horizon <= 0 or longest < 0:
-            used, left = (lead + (0 if held.since else held.history)) * held.period, max((longest + length) * held.period, 0.0)
+            used, left = (
+                (least + (0 if held.since else held.history)) * held.period,
+                max((room + length - least) * held.period, 0.0),
+            )
             raise UsageError(
                 f"diagnose: a horizon of {horizon:g} s does not fit the held-out data: {used:.2g} s serve to find a start and "
                 f"{left:.3g} s are left; expected a positive horizon up to that; shorten it or hold out more",

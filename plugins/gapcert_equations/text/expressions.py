@@ -53,11 +53,13 @@ def force_unit(config: EquationsConfig, q: str) -> str:
     """Of the generalised force at a coordinate: the diagonal entry of the mass matrix times the acceleration decides it."""
     reader, i = _Expressions(config, config), list(config.coordinates).index(q)
     if config.bodies is not None:
-        return reader.checker.text(reader._effort(q))
-    inertia = reader._inertia(i, (config.mass_matrix or [])[i][i]) or NONE
-    if inertia == NONE:  # V/s**2 says more than the same in kg, m, s and A
-        return f"{velocities(config)[f'{q}_dot'].unit}**2"
-    return reader.checker.text(times(times(inertia, reader.checker.names[q]), SECOND, -2))
+        force = reader._effort(q)
+    elif (inertia := reader._inertia(i, (config.mass_matrix or [])[i][i]) or NONE) == NONE:
+        return f"{velocities(config)[f'{q}_dot'].unit}**2"  # V/s**2 says more than the same in kg, m, s and A
+    else:
+        force = times(times(inertia, reader.checker.names[q]), SECOND, -2)
+    usual = {"rad": "N*m", "m": "N"}.get(states(config)[q].unit, "1")
+    return usual if units.unit(usual)[0] == force else reader.checker.text(force)
 
 
 def _texts(config: EquationsConfig) -> Iterator[tuple[Path, str]]:

@@ -14,7 +14,7 @@ from typing import Any, final
 
 from .grammar import ExpressionError, constant
 
-_QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\d\s.+-].*?|1\s*/.*?)?\s*")
+_QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\d\s.+-].*?|1\s*/.*?|(?<=\s)1)?\s*")
 _LETTERS = re.compile(r"[\w%°*/^(). -]{1,60}")
 # Pint evaluates powers of numbers while it reads: only a name or a bracket may have an exponent, and a short one.
 _POWER = re.compile(r"(?<=[^\W\d])\d*\)?(?:\*\*|\^)\(?-?\d{1,2}(?:[./]\d)?\)?(?![\w^.]|\*\*)")

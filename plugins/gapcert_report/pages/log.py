@@ -80,7 +80,7 @@ def _painter(one: Table, c: Column) -> Callable[[Axes], None]:
         for back in one.log.resets:
             ax.axvline(back["at"], color=FAINT, linewidth=0.8)
         # Two dollar signs would make a formula of what stands between them.
-        named = (f"{c.name} [{c.unit}]" if c.unit else c.name).replace("$", r"\$")
+        named = c.title.replace("$", r"\$")
         ax.set(xlabel="time [s]" if one.time else "row", ylabel=named)
 
     return on

@@ -134,7 +134,7 @@ def site_units(model: Model, kind: SiteKind, site: str) -> dict[str, str]:
         return {}
     unit = specs[site]
     if f"{site}_dot" in specs:
-        force = {"rad": "N*m", "m": "N"}.get(unit) or model.force_unit(site) or f"J/{grouped(unit)}"
+        force = model.force_unit(site) or {"rad": "N*m", "m": "N"}.get(unit) or f"J/{grouped(unit)}"
         return {"position": unit, "velocity": f"{unit}/s", "force": force}
     place = position(model, site)
     return {"position": specs[place] if place else f"{grouped(unit)}*s", "velocity": unit, "force": f"{grouped(unit)}/s"}

@@ -153,14 +153,15 @@ class Recording:
         hold: Hold | None = None,
         every: float | None = None,
         place: Place = counted,
+        units_in_names: bool = True,
     ) -> Recording:
         """From named tables of columns, as readers find them.
 
-        columns: channel → column; units: column → unit, the time's too, by default the one in brackets that its name ends in;
+        columns: channel → column; units: column → unit, the time's too; units_in_names: by default it is what the name ends in;
         trajectory: a column whose value changes between trajectories; place: (table, row) → where it stands, for a value that
         is no number. Times since an epoch are counted from the first.
         """
-        units = {**stated_units([time, *columns.values()]), **(units or {})}
+        units = {**(stated_units([time, *columns.values()]) if units_in_names else {}), **(units or {})}
         places = {n: ("units", n) for n in units}
         if (channel := next((n for n in units if n in columns and n not in (time, *columns.values())), None)) is not None:
             what = f"units: '{channel}' is a channel, and units are those of columns; write '{columns[channel]}'"
@@ -298,10 +299,12 @@ class Recording:
 class Reader(ABC):
     """A file format: what a plugin of kind `reader` implements, built by `from_config(config, context)`.
 
-    suffixes: of the files that it understands; `tables` lists what is in one, for a look before anything is configured.
+    suffixes: of the files that it understands; `tables` lists what is in one, for a look before anything is configured;
+    units_in_names: is what a column's name has in brackets at its end its unit, `speed [m/s]`, and no element's name?
     """
 
     suffixes: ClassVar[tuple[str, ...]] = ()
+    units_in_names: ClassVar[bool] = True
 
     @abstractmethod
     def read(self) -> Recording:
@@ -361,8 +364,7 @@ def seconds(table: str, column: str, values: Any, unit: str, place: Place = coun
     if raw.dtype.kind == "M":
         return np.asarray((raw - raw[0]) / np.timedelta64(1, "s"), dtype=np.float64)
     factor = _factor(column, unit, "s") if unit != "s" else 1.0
-    whole = raw.dtype.kind in "iu"
-    numbers = raw.astype(np.int64) if whole else _numbers(table, column, values, place)
+    numbers = raw.astype(np.int64) if raw.dtype.kind in "iu" else _numbers(table, column, values, place)
     finite = numbers[np.isfinite(numbers)]
     if len(finite) and float(finite[0]) * factor > THRESHOLDS.epoch:
         numbers = numbers - finite[0]

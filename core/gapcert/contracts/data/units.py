@@ -10,7 +10,7 @@ from typing import Any
 
 from gapcert.numerics.errors import clipped
 
-_QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*((?<=\s)1/.*?|[^\d\s.].*?)?\s*")
+_QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*((?<=\s)1(?:/.*?)?|[^\d\s.].*?)?\s*")
 _TRIED = (0.0, 1.0)  # a unit with an offset moves the one, one of another size the other
 _ALIAS = {"s": 1.0, "ms": 1e-3}
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -43,7 +43,7 @@ def grouped(unit: str) -> str:
 
 def product(powers: Iterable[tuple[str, int]]) -> str:
     """The text of a product of powers of units; `1` for none."""
-    given = list(powers)
+    given = [(unit, n) for unit, n in powers if unit != "1"]
     over = [unit if n == 1 else f"{grouped(unit)}**{n}" for unit, n in given if n > 0]
     under = ["/" + (grouped(unit) if n == -1 else f"{grouped(unit)}**{-n}") for unit, n in given if n < 0]
     return ("*".join(over) or "1") + "".join(under)
