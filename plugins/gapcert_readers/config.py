@@ -69,7 +69,7 @@ class Csv(Table):
     """Text with a header and a row per line; commas, semicolons, tabs or blanks between the values, as the file has it.
 
     With semicolons or tabs the decimal sign may be a comma. What is empty, `NA` or `NaN` is a missing value. Text is in UTF-8,
-    or else taken for Latin-1.
+    or else taken for Latin-1. What stands above the header is passed over; a header may stand behind #.
     """
 
     kind: Literal["csv"] = "csv"
