@@ -275,6 +275,8 @@ def _laws(path: _Fitted, correction: Correction | None = None) -> tuple[Law, ...
         if len(drawn) >= THRESHOLDS.law_pictures:
             break
         place = path.place(site, "coordinate")
+        if not path.tangent.felt(place.response):
+            continue
         axes, nothing = path.axes(place)[: THRESHOLDS.law_pictures - len(drawn)], np.zeros(path.x.shape[:2])
         left = [_law(path, place, (), axis, nothing) for axis in axes]
         if correction is not None and correction.site == site:

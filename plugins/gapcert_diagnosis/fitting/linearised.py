@@ -283,6 +283,17 @@ class Tangent:
         """The same for whatever moves the next state by B (W, S, nx) per unit."""
         return self.linear.project(self.linear.push(along=B, force=force))
 
+    def felt(self, B: Array) -> bool:
+        """Does any channel show what moves the next state by B (W, S, nx)?"""
+        return bool(self.driven(B, np.ones((*self.x.shape[:2], 1))).any())
+
+    def shown(self, channel: int, added: Array) -> Array:
+        """What is added (W, S, K) to one measured channel, (W, L·ny, K), with the starts free to follow."""
+        samples = np.concatenate([added[:, :: self.windows.measured.repeat], added[:, -1:]], axis=1)
+        rows = np.zeros((*self.windows.y.shape, added.shape[2]))
+        rows[:, :, channel] = samples[:, : rows.shape[1]] * self.windows.weight[:, :, channel, None]
+        return self.linear.project(_rows(rows))
+
     def project(self, rows: Array) -> Array:
         """Rows (W, L·ny, K), or (W, L·ny), without what the starts can make."""
         return self.linear.project(rows.copy().reshape(*rows.shape[:2], -1)).reshape(rows.shape)

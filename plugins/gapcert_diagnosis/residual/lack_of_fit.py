@@ -25,7 +25,7 @@ from gapcert_diagnosis.fitting.fit import slopes
 from gapcert_diagnosis.fitting.linearised import Tangent, states
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
-from .regression import features, input_features
+from .regression import features, hats, input_features
 from .whiteness import noise
 
 KINDS = {
@@ -199,13 +199,13 @@ def _shapes(motion: Tangent, site: str) -> dict[str, Array]:
     speed = motion.x[..., v] / _size(motion.x[..., v])
     fast, sign = np.abs(speed), np.tanh(speed / THRESHOLDS.sign_width)[..., None]
     near = np.exp(-fast[..., None] / THRESHOLDS.speed_decays)
-    hats = np.concatenate([_hats(fast, np.quantile(fast, THRESHOLDS.speeds)), near], axis=-1)
+    curves = np.concatenate([hats(fast, np.quantile(fast, THRESHOLDS.speeds)), near], axis=-1)
     sides = np.maximum(np.stack([speed, -speed], axis=-1), 0)
     load = np.minimum(effort / _size(effort), THRESHOLDS.effort_peak)[..., None]
     t = motion.windows.t[:, None] + np.arange(motion.x.shape[1]) * motion.model.period
     late = ((t - t.min()) / max(float(np.ptp(t)), 1e-12))[..., None]
     out = {
-        f"the speed of {site}": np.concatenate([sign * hats, sign * near**2, hats, sides, sides**2, sides > 0], axis=-1),
+        f"the speed of {site}": np.concatenate([sign * curves, sign * near**2, curves, sides, sides**2, sides > 0], axis=-1),
         f"the load at {site}": np.concatenate([sign * load, sign * np.sqrt(load), load], axis=-1),
         "the time": np.concatenate([b * late**k for b in (1.0, sign, speed[..., None]) for k in (1, 2)], axis=-1),
     }
@@ -215,17 +215,11 @@ def _shapes(motion: Tangent, site: str) -> dict[str, Array]:
         out["the size of the input"] = np.concatenate([*cut, np.abs(share)], axis=-1)
     if q is not None:
         z = motion.x[..., q]
-        place, at = _hats(z, np.quantile(z, THRESHOLDS.places)), (z - z.mean())[..., None] / max(float(np.ptp(z)) / 2, 1e-12)
+        place, at = hats(z, np.quantile(z, THRESHOLDS.places)), (z - z.mean())[..., None] / max(float(np.ptp(z)) / 2, 1e-12)
         powers = [at**2, at**3, at**4, at * np.abs(at), np.maximum(at - 0.5, 0), np.maximum(-at - 0.5, 0)]
         moving = [place * speed[..., None], place * sign]
         out[f"the position of {site}"] = np.concatenate([place, *powers, *moving], axis=-1)
     return out
-
-
-def _hats(z: Array, knots: Array) -> Array:
-    """Piecewise linear functions (…, K) of z, each 1 at one knot and 0 at the others."""
-    at = np.unique(knots)
-    return np.stack([np.interp(z, at, e) for e in np.eye(len(at))], axis=-1)
 
 
 def _size(a: Array) -> float:

@@ -49,12 +49,28 @@ class Learnt:
 
 
 def learn(motion: Tangent, site: str) -> Learnt:
-    """From what the inputs and the path suggest at a site."""
+    """Of a force, from what the inputs and the path suggest at a site."""
     found = {**input_features(motion), **features(motion, site)}
-    columns = motion.coarse(motion.responses(site, np.concatenate(list(found.values()), axis=-1)))
+    made = motion.responses(site, np.concatenate(list(found.values()), axis=-1))
+    return _learnt(motion, site, found, made, motion.residual[..., None])
+
+
+def learn_shown(motion: Tangent, channel: int) -> Learnt:
+    """Of the residual of one channel: what it shows beside its equation, which moves nothing."""
+    found, name = {**input_features(motion), **_shown_features(motion)}, motion.windows.measured.channels[channel].name
+    if name in (s.name for s in motion.model.states):
+        del found["position memory"]  # the path of a state is as its own channel measured it, noise included
+    made = motion.shown(channel, np.concatenate(list(found.values()), axis=-1))
+    own = np.zeros((*motion.windows.y.shape, 1))
+    own[:, :, channel, 0] = motion.residual.reshape(motion.windows.y.shape)[..., channel]
+    return _learnt(motion, name, found, made, own.reshape(*motion.residual.shape, 1))
+
+
+def _learnt(motion: Tangent, site: str, found: Mapping[str, Array], made: Array, rows: Array) -> Learnt:
+    columns = motion.coarse(made)
     kind = np.repeat(list(found), [f.shape[-1] for f in found.values()])
     columns = columns / (np.sqrt(np.mean(columns**2, axis=(0, 1))) + 1e-300)
-    residual = motion.coarse(motion.residual[..., None])[..., 0]
+    residual = motion.coarse(rows)[..., 0]
     energy = np.sum(residual**2, axis=1)
     even = np.sqrt(np.minimum(1.0, THRESHOLDS.loud_window * np.median(energy) / np.maximum(energy, 1e-300)))[:, None]
     rng, count = np.random.default_rng(0), len(columns)
@@ -140,15 +156,9 @@ def _input_hysteresis(motion: Tangent) -> Array:
 
 def features(motion: Tangent, site: str) -> dict[str, Array]:
     """Forces (W, S, K) of the present state and input, and of the path of the site's position."""
-    u, (q, v) = motion.u, motion.place(site)
-    z = np.concatenate([motion.x, u], axis=-1)
-    z = z / (np.sqrt(np.mean(z**2, axis=(0, 1))) + 1e-12)
-    speed = np.tanh(10 * z[..., v : v + 1])
-    static = [z, z * np.abs(z), z**3, np.tanh(3 * z), np.tanh(10 * z), speed * np.abs(z), np.ones_like(speed)]
-    if u.shape[-1]:
-        cuts = ((1, 0.8), (1, 0.95), (-1, 0.2), (-1, 0.05))
-        static += [np.maximum(s * (u - np.quantile(u, p, axis=(0, 1))), 0) for s, p in cuts]
-    found = {"static": np.concatenate(static, axis=-1)}
+    q, v = motion.place(site)
+    z, static = _static(motion)
+    found = {"static": np.concatenate([static, np.tanh(10 * z[..., v : v + 1]) * np.abs(z)], axis=-1)}
     if q is not None:
         span = float(np.ptp(motion.x[..., q])) or 1.0
         angle = 2 * np.pi * PERIODS / span * motion.x[..., q : q + 1]
@@ -156,6 +166,34 @@ def features(motion: Tangent, site: str) -> dict[str, Array]:
         bend = motion.once("bends", lambda: _bends(motion))[:, :, q]
         found["position memory"] = np.concatenate([bend, bend * np.abs(bend)], axis=-1)
     return found
+
+
+def _shown_features(motion: Tangent) -> dict[str, Array]:
+    """What may be added (W, S, K) to a reading: laws of the present state and input, and of the path of any state."""
+    bend = motion.once("bends", lambda: _bends(motion)).reshape(*motion.x.shape[:2], -1)
+    z, static = _static(motion)
+    n = z.shape[-1]
+    several = [z[..., i : i + 1] * z[..., i + 1 :] for i in range(n)]
+    curves = [hats(z[..., i], np.quantile(z[..., i], THRESHOLDS.curve_knots)) for i in range(n)]
+    law = np.concatenate([static, *several, *curves], axis=-1)
+    return {"static": law, "position memory": np.concatenate([bend, bend * np.abs(bend)], axis=-1)}
+
+
+def _static(motion: Tangent) -> tuple[Array, Array]:
+    """State and input over their root mean squares, and functions of single ones of them."""
+    u, z = motion.u, np.concatenate([motion.x, motion.u], axis=-1)
+    z = z / (np.sqrt(np.mean(z**2, axis=(0, 1))) + 1e-12)
+    static = [z, z * np.abs(z), z**3, np.tanh(3 * z), np.tanh(10 * z), np.ones((*z.shape[:2], 1))]
+    if u.shape[-1]:
+        cuts = ((1, 0.8), (1, 0.95), (-1, 0.2), (-1, 0.05))
+        static += [np.maximum(s * (u - np.quantile(u, p, axis=(0, 1))), 0) for s, p in cuts]
+    return z, np.concatenate(static, axis=-1)
+
+
+def hats(z: Array, knots: Array) -> Array:
+    """Piecewise linear functions (…, K) of z, each 1 at one knot and 0 at the others."""
+    at = np.unique(knots)
+    return np.stack([np.interp(z, at, e) for e in np.eye(len(at))], axis=-1)
 
 
 def _bends(motion: Tangent) -> Array:

@@ -23,7 +23,7 @@ from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_figures import KINDS
 
 from .lack_of_fit import Lack, lack
-from .regression import Learnt, correction, learn
+from .regression import Learnt, correction, learn, learn_shown
 from .whiteness import Growth, growth
 
 
@@ -33,7 +33,8 @@ class Left:
     """The residual of a final model in long and short windows, and how it was judged.
 
     learnt: per coordinate; share: of the effort, the force that would leave as much; lack: what it goes with, though it may be
-    too little for the other tests, where something was fitted.
+    too little for the other tests, where something was fitted; shown: learnt per channel above its noise, of what it may show
+    beside its equation.
     """
 
     long: Tangent
@@ -42,11 +43,12 @@ class Left:
     learnt: tuple[Learnt, ...]
     share: float
     lack: Lack | None = None
+    shown: tuple[Learnt, ...] = ()
 
     @property
     def best(self) -> Learnt | None:
         """Where most is learnt."""
-        return max(self.learnt, key=lambda k: k.share, default=None)
+        return max((*self.learnt, *self.shown), key=lambda k: k.share, default=None)
 
     @property
     def coherent(self) -> bool:
@@ -55,6 +57,7 @@ class Left:
         learnt = self.best is not None and self.best.share > (
             THRESHOLDS.learnt_share if self.growth.sigmas > 2 else THRESHOLDS.learnt_plenty
         )
+        learnt |= any(k.share > THRESHOLDS.learnt_plenty for k in self.shown)
         return self.growth.sigmas > THRESHOLDS.growth_sigmas or self.growth.chi_short > THRESHOLDS.coarse_residual or learnt
 
     @property
@@ -86,7 +89,17 @@ def _judged(long: Tangent, short: Tangent, seed: int) -> Left:
     excess = [float(grown.excess.sum()), *(k.share * _square(m) for k, m in both)]
     if grown.chi_short > THRESHOLDS.coarse_residual:
         excess.append(_square(long))
-    found = Left(long, short, grown, learnt, _share(long, coordinates, max(excess)))
+    share, shown = _share(long, coordinates, max(excess)), tuple[Learnt, ...]()
+    if loud := _loud(long, short):
+        shown = tuple(max((learn_shown(m, c) for m in (short, long)), key=lambda k: k.share) for c in loud)
+        own = {c: max(k.share * square, float(grown.excess[c])) for (c, square), k in zip(loud.items(), shown, strict=True)}
+        own |= {c: square for c, square in loud.items() if square > THRESHOLDS.coarse_residual}
+        share = max(share, *(_share(long, coordinates, size, c) for c, size in own.items()))
+        # What a law of one channel alone explains much better is no small force, which all channels would show.
+        forced = max((k.share for k in learnt), default=0.0)
+        if any(k.share > max(THRESHOLDS.learnt_plenty, THRESHOLDS.shown_alone * forced) for k in shown):
+            share = math.inf
+    found = Left(long, short, grown, learnt, share, shown=shown)
     if not long.fitted.hypothesis.charged or (found.coherent and found.share > THRESHOLDS.faint_force):
         return found
     return replace(found, lack=lack(long, short, seed))
@@ -105,12 +118,32 @@ def _square(motion: Tangent) -> float:
     return float(np.mean(motion.residual**2) * motion.windows.y.shape[2])
 
 
-def _share(motion: Tangent, sites: tuple[str, ...], excess: float) -> float:
-    """Force over effort, at the coordinate where least force leaves a mean square `excess` (summed over channels)."""
+def _loud(long: Tangent, short: Tangent) -> dict[int, float]:
+    """Mean squares of the channels that are above their noise in short windows and in long ones.
+
+    Where an input jumps, a channel that shows it at once does so, too, and what is taken for its noise is too much: the noise
+    is no more than what varies from sample to sample in the residual, jumps aside.
+    """
+    rows, rough = [m.residual.reshape(m.windows.y.shape) for m in (short, long)], long.windows.measured.rough
+    floor = np.where(rough > 0 if rough.size else False, 1.0, np.fmin(_scatter(rows[1]), 1.0))
+    least = np.minimum(*(np.mean(r**2, axis=(0, 1)) for r in rows))
+    return {c: float(v) for c, v in enumerate(least) if v > (THRESHOLDS.loud_channel * floor[c]) ** 2}
+
+
+def _scatter(rows: Array) -> Array:
+    """σ (ny,) of white noise beneath rows (W, L, ny): the median of |k-th differences| is 0.6745 √C(2k, k) σ."""
+    found = [np.median(np.abs(np.diff(rows, k, axis=1)), axis=(0, 1)) / math.sqrt(math.comb(2 * k, k)) for k in (2, 3, 4)]
+    return np.asarray(np.min(found, axis=0) / 0.6745)
+
+
+def _share(motion: Tangent, sites: tuple[str, ...], excess: float, channel: int | None = None) -> float:
+    """Force over effort, at the coordinate where least force leaves a mean square `excess`, of one channel or summed over all;
+    infinite where no force shows."""
     shares: list[float] = [math.inf]
     for site in sites:
-        made = motion.responses(site, motion.effort(site)[..., None])
-        shares.append(math.sqrt(excess / max(float(np.mean(made**2)) * motion.windows.y.shape[2], 1e-300)))
+        made = motion.responses(site, motion.effort(site)[..., None]).reshape(motion.windows.y.shape) ** 2
+        of_effort = float(np.mean(made) * motion.windows.y.shape[2] if channel is None else np.mean(made[..., channel]))
+        shares.append(math.sqrt(excess / max(of_effort, 1e-300)))
     return min(shares)
 
 
@@ -154,10 +187,12 @@ def unexplained(found: Left) -> Unexplained:
     kinds = {n: share for n, share in best.kinds.items() if share > 0} or dict(best.kinds)
     if best.memory > THRESHOLDS.learnt_share:
         return Unexplained(True, looks_like=kinds, where=where)
-    if best.share > THRESHOLDS.learnt_share:
+    if best.share > THRESHOLDS.learnt_share and best in found.learnt:
         formulas = (correction(m, best.site) for m in (found.short, found.long))
         formula = max((f for f in formulas if f is not None), key=lambda f: f.explained, default=None)
         return Unexplained(False, looks_like=kinds, where=where, correction=formula)
+    if best.share > THRESHOLDS.learnt_share:
+        return Unexplained(False, looks_like=kinds, where=where)
     # A push at the edge of a window hides in its free start, so these windows overlap by half.
     windows, short = found.short.windows, found.short.fitted
     overlapping = windows.measured.windows(windows.length, max(1, windows.length // 2))
@@ -247,7 +282,8 @@ def evidence(found: Left) -> dict[str, dict[str, float]]:
     }
     for i, spec in enumerate(long.model.inputs):
         out[f"with {spec.name}"] = by(_leading(r, long.windows.u[..., i], m.history, m.samples(THRESHOLDS.leading_input)))
-    forces = {s: _Missing.of(found.short, s) for s in long.model.sites("coordinate")}
+    felt = [s for s in long.model.sites("coordinate") if found.short.felt(found.short.probed(s).reshape(found.short.x.shape))]
+    forces = {s: _Missing.of(found.short, s) for s in felt}
     seen = {s: f for s, f in forces.items() if f.seen}
     for i, spec in enumerate((*long.model.states, *long.model.inputs) if seen else ()):
         out[f"force with {spec.name}"] = {s: f.together(i) for s, f in seen.items()}

@@ -1,0 +1,122 @@
+"""What only an output shows: a sensor of force, current or acceleration whose equation lacks something that moves nothing."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+import gapcert as gc
+from gapcert.plugin import Recording, Trajectory
+
+H, N = 0.01, 2400
+T = H * np.arange(N)
+MOTOR = {
+    "states": {"w": "rad/s"},
+    "inputs": {"u": "V"},
+    "parameters": {"tau": {"value": "0.2 s", "tolerance": "3 %"}, "k": "4 rad/s/V", "R": "1.5 ohm", "c": "0.2 V*s/rad"},
+    "derivative": {"w": "(k*u - w)/tau"},
+    "outputs": {"w": "w", "i": "(u - c*w)/R"},
+}
+STRUT = {
+    "states": {"x": "m"},
+    "inputs": {"v": "m/s"},
+    "parameters": {"c": {"value": "300 N*s/m", "tolerance": "5 %"}, "k": {"value": "2000 N/m", "tolerance": "5 %"}},
+    "derivative": {"x": "v"},
+    "outputs": {"x": "x", "F": "c*v + k*x"},
+}
+
+
+def drive(rng, kind):
+    if kind == "steps":
+        return rng.normal(size=N // 40).repeat(40)
+    return sum(rng.normal() * np.sin(2 * np.pi * f * T + rng.uniform(0, 6)) for f in rng.uniform(0.1, 2.5, 6))
+
+
+def held(pull, u):
+    y = 0.0
+    for value in u:
+        yield y
+        y = pull(y, value)
+
+
+def motion(name, rng, kind):
+    """(model, input, state, output), without noise, as the model has them."""
+    u = drive(rng, kind)
+    if name == "motor":
+        w = np.array(list(held(lambda y, a: 4 * a + (y - 4 * a) * np.exp(-H / 0.2), u)))
+        return MOTOR, u, w, (u - 0.2 * w) / 1.5
+    x = np.array(list(held(lambda y, a: y + H * a, 0.3 * u)))
+    return STRUT, 0.3 * u, x, 300 * 0.3 * u + 2000 * x
+
+
+def play(z, half):
+    at, out = z[0], []
+    for value in z:
+        at = min(max(at, value - half), value + half)
+        out.append(value - at)
+    return np.array(out)
+
+
+LACKS = {
+    "a cubic": lambda u, z: (z / z.std()) ** 3,
+    "a kink": lambda u, z: np.abs(u),
+    "dry friction": lambda u, z: np.tanh(30 * u / u.std()),
+    "a product": lambda u, z: u * z,
+    "a lag": lambda u, z: lfilter([H / 0.3], [1, H / 0.3 - 1], u),
+    "hysteresis": lambda u, z: play(z, 0.3 * z.std()),
+}
+
+
+def diagnosed(name, lack, floors, seed, kind="smooth", colour=0.0):
+    """The diagnosis of a log whose last output lacks something of so many noise floors."""
+    rng = np.random.default_rng(seed)
+    data, u, z, y = motion(name, rng, kind)
+    noise = [lfilter([np.sqrt(1 - colour**2)], [1, -colour], rng.normal(size=N)) for _ in range(2)]
+    sigma = 0.01 * y.std()
+    beside = np.zeros(N) if lack is None else LACKS[lack](u, z)
+    beside = beside * floors * sigma / (beside.std() or 1.0)
+    shown, inputs = list(data["outputs"]), list(data["inputs"])
+    channels = {shown[0]: z + 0.003 * z.std() * noise[0], shown[1]: y + beside + sigma * noise[1], inputs[0]: u}
+    config = gc.registry().config("model", "equations").model_validate({"kind": "equations", "period": f"{H} s", **data})
+    model = gc.registry().build("model", "equations", config, gc.Context(None))
+    return gc.diagnose(model, Recording((Trajectory(T, channels, "log"),), {}, "zero"))
+
+
+@pytest.mark.parametrize("lack", LACKS)
+@pytest.mark.parametrize(("name", "kind"), [("motor", "steps"), ("strut", "smooth")])
+def test_nothing_is_no_answer_to_what_an_output_shows(name, kind, lack):
+    found = diagnosed(name, lack, 8.0, 11, kind)
+    assert found.verdict != "nothing"
+    if found.verdict == "unexplained":
+        assert found.unexplained.looks_like
+    else:
+        assert found.causes
+
+
+@pytest.mark.parametrize("lack", ["dry friction", "hysteresis"])
+def test_what_is_left_is_told_by_its_kind(lack):
+    found = diagnosed("strut", lack, 20.0, 5)
+    assert found.verdict == "unexplained"
+    kinds = found.unexplained.looks_like
+    expected = {"dry friction": "static", "hysteresis": "position memory"}[lack]
+    assert max(kinds, key=lambda k: kinds[k]) == expected
+    assert found.unexplained.needs_memory == (lack == "hysteresis")
+
+
+@pytest.mark.parametrize("colour", [0.0, 0.5, 0.9])
+@pytest.mark.parametrize("name", ["motor", "strut"])
+def test_noise_of_any_colour_is_nothing(name, colour):
+    for seed in range(3):
+        assert diagnosed(name, None, 0.0, seed, ("smooth", "steps")[seed % 2], colour).verdict == "nothing"
+
+
+def test_an_output_alone_whose_state_nothing_shows_is_answered():
+    """The strut's force alone: its position is in no channel, and moves none but through the force."""
+    rng = np.random.default_rng(2)
+    data, v, _, force = motion("strut", rng, "smooth")
+    data = {**data, "outputs": {"F": "c*v"}}
+    config = gc.registry().config("model", "equations").model_validate({"kind": "equations", "period": f"{H} s", **data})
+    model = gc.registry().build("model", "equations", config, gc.Context(None))
+    noisy = force + 0.01 * force.std() * rng.normal(size=N)
+    found = gc.diagnose(model, Recording((Trajectory(T, {"F": noisy, "v": v}, "log"),), {}, "zero"))
+    assert found.verdict == "unexplained"
+    assert np.isfinite([m.after for m in found.residual.values()]).all()
