@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, final
+from typing import Any, ClassVar, Literal, TypeVar, final
 
 import numpy as np
 
@@ -31,6 +31,8 @@ from .search.candidates import Candidate, Library
 from .search.criterion import keys, without
 from .search.engine_settings import Setting, across
 
+T = TypeVar("T")
+U = TypeVar("U")
 _MEASURED = {"input": "{} where it acts", "output": "{} with a second sensor", "coordinate": "the force at {}"}
 
 
@@ -158,6 +160,29 @@ class Clock:
             self.emit(Event("progress", "diagnosis", {"done": self.count, "unit": "hypotheses", "text": text, **more}))
 
 
+@final
+class Spared:
+    """Runs what comes after the answer: what fails there costs its own part only, and is told in a sentence."""
+
+    PARTS: ClassVar = {"told_apart": "experiment", "figure": "pictures", "evidence": "tests of the residual"}
+
+    def __init__(self) -> None:
+        self.told: list[str] = []
+
+    def __call__(self, make: Callable[..., T], otherwise: U, *given: Any) -> T | U:
+        """`make(*given)`; UsageError passes, as it is about what was asked."""
+        try:
+            return make(*given)
+        except UsageError:
+            raise
+        except Exception as error:  # a defect after the answer must not take it along
+            part = self.PARTS.get(getattr(make, "__name__", ""), "rest")
+            self.told.append(
+                f"the {part} could not be made ({type(error).__name__}: {error}); please report it; the answer stands"
+            )
+            return otherwise
+
+
 def _searched(problem: DiagnosisProblem) -> Diagnosis:
     """With equations: effects are added to them, and what does not pay is dropped."""
     data, lap, seed = _Data.of(problem), problem.clock.lap, problem.seed
@@ -181,11 +206,13 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
     lap("gain")
     dataset, asked = answer.dataset, problem.experiment
     limits = Limits.of(data.library.model, dataset, asked.get("limits"), asked.get("seconds", 12.0))
-    design = told_apart(answer.causes, answer.fit, answer.ties, dataset, limits, seed)[0]
+    spared = Spared()
+    design, _ = spared(told_apart, (None, ()), answer.causes, answer.fit, answer.ties, dataset, limits, seed)
     lap("experiment")
     left = leftover.left(data.library.extended(answer.causes, answer.fit.values), answer.fit, seed)
     doubted = doubt(answer.fit)
-    verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, design is not None, bool(doubted))
+    undecided = design is not None or bool(answer.ties and spared.told)
+    verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, undecided, bool(doubted))
     lap("leftover")
     ties = [tuple(c.key for c in tie) for tie, _ in answer.ties]
     ties += [(("engine-setting", s.runner_up.setting),) for s in settings if s.runner_up and s.margin < THRESHOLDS.tie_score]
@@ -200,16 +227,16 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
         tuple(ties),
         _experiment(answer, design is not None),
         rest,
-        figure(answer.search, answer.causes, answer.fit, judge, design, rest.correction if rest else None, plain),
+        spared(figure, None, answer.search, answer.causes, answer.fit, judge, design, rest.correction if rest else None, plain),
         design=design,
-        evidence=leftover.evidence(left),
+        evidence=spared(leftover.evidence, {}, left),
         negligible=tuple((*k, s) for k, s in answer.negligible.items() if k not in keys(answer.causes)),
         smallest=smallest(answer.search) if verdict == "nothing" else (),
         log={**dataset.log, "hold": dataset.hold or "undeclared"},
         assumptions=(*data.assumptions, *doubted),
         # How long the experiments were, of which none tells the ties apart.
         seconds=limits.seconds if answer.ties and limits.inputs and not design else None,
-        warnings=coarse(answer.fit),
+        warnings=(*coarse(answer.fit), *spared.told),
         refitted=_refitted(answer),
     )
 

@@ -350,8 +350,8 @@ def shapes(limits: Mapping[str, tuple[float, float]], seconds: float, measured: 
 
 def _returning(shape: Array) -> Array:
     """The first quarter of a shape, then its opposite twice, then itself."""
-    quarter = shape[: len(shape) // 4]
-    return np.concatenate([quarter, -quarter, -quarter, quarter])
+    quarter = shape[: -(-len(shape) // 4)]
+    return np.concatenate([quarter, -quarter, -quarter, quarter])[: len(shape)]
 
 
 def _beat(measured: Dataset) -> float:

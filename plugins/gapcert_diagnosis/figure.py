@@ -200,7 +200,8 @@ class _Fitted:
         x, u = self.flat
         if kind == "input":
             i = [s.name for s in self.base.inputs].index(site)
-            size, unit = float(np.std(u[:, i])) or 1.0, self.base.inputs[i].unit
+            # The deviation of a constant is its rounding.
+            size, unit = max(float(np.std(u[:, i])), 1e-3 * float(np.abs(u[:, i]).max())) or 1.0, self.base.inputs[i].unit
             on = u + size * (np.arange(self.base.nu) == i)
             moved = difference(self.base.states, self.base.step(x, on).x, self._still) / size
             label = f"missing input [{unit}]"

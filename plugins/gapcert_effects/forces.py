@@ -11,7 +11,7 @@ from gapcert.plugin import EffectParameter, Extension, Memory
 from gapcert_effects.thresholds import THRESHOLDS
 
 from .experiments import BOTH_WAYS, FREE_DECAY, LEVELS, PLACES, SHAKE_AND_HOLD, SMALL_AND_LARGE, VARY_SPEED
-from .law import NEVER, Law, carries, driven, neighbour, placed, spread, straight, tilts
+from .law import NEVER, Law, carries, driven, moves, neighbour, placed, spread, straight, tilts
 
 
 @final
@@ -143,7 +143,7 @@ class Cogging(Law):
     )
     equation = "f = amplitude·sin(2π·q/period + phase)"
     adds: ClassVar = {"force": "{amplitude}*sin(2*pi*{q}/{period} + {phase})"}
-    where = (placed,)
+    where = (placed, moves)
     signature = "slow motion is uneven in a pattern that belongs to places, and rest is preferred at some of them"
     experiment = "move slowly and evenly over the whole range: the pattern is that of the place, not of the time"
     amplitude = "amplitude"

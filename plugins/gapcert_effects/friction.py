@@ -9,7 +9,7 @@ from typing import ClassVar, final
 from gapcert.plugin import EffectParameter, Memory
 
 from .experiments import BOTH_WAYS, CREEP, FREE_DECAY, LOADS, REST, VARY_SPEED
-from .law import Law, driven, placed, spread
+from .law import Law, driven, moves, placed, spread
 
 _COEFFICIENT = {"force": 1, "velocity": -1}
 
@@ -100,6 +100,7 @@ class CoulombFriction(Law):
     parameters = (_dry("level"),)
     equation = "f = −level·sgn(v); |f| ≤ level at rest"
     adds: ClassVar = {"dry_friction": "{level}"}
+    where = (moves,)
     signature = "amplitudes fall by equal steps, and motion ends in rest away from equilibrium"
     experiment = REST
     amplitude = "level"
@@ -123,6 +124,7 @@ class AsymmetricCoulombFriction(Law):
     parameters = (_dry("plus"), _dry("minus"))
     equation = "f = −plus if v > 0, minus if v < 0; −plus ≤ f ≤ minus at rest"
     adds: ClassVar = {"force": "({minus} - {plus})/2", "dry_friction": "({plus} + {minus})/2"}
+    where = (moves,)
     signature = "amplitudes fall by steps that differ between the directions"
     experiment = BOTH_WAYS
     family = "dry"
@@ -149,6 +151,7 @@ class StribeckFriction(Law):
     )
     equation = "|f| = level·(1 + ratio·exp(−(v/velocity)²)) against the motion"
     adds: ClassVar = {"dry_friction": "{level}*(1 + {ratio}*exp(-({v}/{velocity})**2))"}
+    where = (moves,)
     signature = "motion stops and starts in jerks at low speed"
     experiment = REST
     amplitude = "level"
@@ -165,7 +168,7 @@ class LoadDependentFriction(Law):
     parameters = (EffectParameter("coefficient", {}, (0.05, 0.2), 0.0, 2.0, plausible=(0.0, 0.9)),)
     equation = "|f| = coefficient·|applied force| against the motion"
     adds: ClassVar = {"dry_friction": "{coefficient}*abs({f})"}
-    where = (driven,)
+    where = (driven, moves)
     signature = "the drive is weaker when it pushes and stronger when it brakes; without input there is no loss"
     experiment = LOADS
     amplitude = "coefficient"
@@ -196,7 +199,7 @@ class DahlFriction(Law):
     equation = "f = −level·s, displacement·ṡ = v − |v|·s"
     memory = Memory("{level}_bend", "1", _bristle("1"))
     adds: ClassVar = {"force": f"-{{level}}*({memory.next})"}
-    where = (placed,)
+    where = (placed, moves)
     signature = "after every reversal the friction builds up over a short way, and a resting joint springs back"
     experiment = CREEP
     amplitude = "level"
@@ -222,7 +225,7 @@ class LugreFriction(Law):
     equation = "f = −level·s, displacement·ṡ = v − |v|·s/γ, γ = 1 + ratio·exp(−(v/velocity)²)"
     memory = Memory("{level}_bend", "1", _bristle("(1 + {ratio}*exp(-({v}/{velocity})**2))"))
     adds: ClassVar = {"force": f"-{{level}}*({memory.next})"}
-    where = (placed,)
+    where = (placed, moves)
     signature = "friction builds up over a short way after every reversal, overshoots, and falls with speed"
     experiment = CREEP
     amplitude = "level"

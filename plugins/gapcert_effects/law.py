@@ -13,6 +13,7 @@ from gapcert.plugin import Effect, Extension, Memory, site_units
 from gapcert_effects.plugin import SENTENCES
 
 _LENGTHS = ("m", "mm", "cm", "km")
+_TURNS = ("rad", "deg", "rev", "turn", "rpm")
 NEVER = 1e15  # a limit that nothing reaches; exact in min and max, and within rounding elsewhere
 _SITE = {name: f"{{{name}}}" for name in "qvufyth"}
 """Placeholders of an Extension, which the model fills."""
@@ -76,6 +77,11 @@ def straight(site: str, model: gc.Model) -> bool:
     """Is the coordinate a length?"""
     units = {s.name: s.unit for s in model.states}
     return units[site] in _LENGTHS if _mechanical(model) else units[site].removesuffix("/s") in _LENGTHS
+
+
+def moves(site: str, model: gc.Model) -> bool:
+    """Does something move there, by its unit: is it a length, an angle or a pure number, or how fast one changes?"""
+    return straight(site, model) or {s.name: s.unit for s in model.states}[site].removesuffix("/s") in (*_TURNS, "1")
 
 
 def _turning(site: str, model: gc.Model) -> bool:

@@ -181,3 +181,31 @@ def test_a_planted_fault_is_caught(fault, check, says):
 @pytest.mark.parametrize("check", CHECKS)
 def test_every_check_has_a_planted_fault(check):
     assert check in {c for _, c, _ in FAULTS}
+
+
+def plant(unit, mechanical):
+    """A plant of one state, or of one coordinate, in a unit."""
+    inputs = {"u": f"{unit}/s**2" if mechanical else unit}
+    where = {"coordinates": {"q": unit}, "mass_matrix": [["1"]], "bias": {"q": "k*q"}, "parameters": {"k": "2 1/s^2"}}
+    rates = {"states": {"q": unit}, "derivative": {"q": "(u - q)/tau"}, "parameters": {"tau": "2 s"}}
+    whole = {**where, "forces": {"q": "u"}} if mechanical else rates
+    config = (
+        gc.registry()
+        .config("model", "equations")
+        .model_validate({"kind": "equations", "period": "10 ms", "inputs": inputs, **whole})
+    )
+    return gc.registry().build("model", "equations", config, gc.Context(None))
+
+
+DRY = {"coulomb-friction", "stribeck-friction", "asymmetric-coulomb-friction", "load-dependent-friction", "cogging"}
+
+
+@pytest.mark.parametrize("mechanical", [True, False])
+@pytest.mark.parametrize(("unit", "moving"), [("m", True), ("rad", True), ("K", False), ("V", False), ("Pa", False)])
+def test_what_only_bodies_do_is_offered_only_where_something_moves(unit, moving, mechanical):
+    model = plant(unit if mechanical or not moving else f"{unit}/s", mechanical)
+    offered = {n for n in gc.registry().names("effect") if gc.registry().build("effect", n).site == "coordinate"}
+    offered = {n for n in offered if gc.registry().build("effect", n).applies("q", model)}
+    named = DRY if mechanical else DRY - {"cogging"}
+    assert offered & DRY == (named if moving else set())
+    assert {"viscous-friction", "constant-force", "external-push"} <= offered

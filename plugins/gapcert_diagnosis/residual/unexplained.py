@@ -47,8 +47,10 @@ class Left:
 
     @property
     def best(self) -> Learnt | None:
-        """Where most is learnt."""
-        return max((*self.learnt, *self.shown), key=lambda k: k.share, default=None)
+        """Where most is learnt: of a force, which all channels show, unless a law of one channel alone explains much more."""
+        force, own = (max(some, key=lambda k: k.share, default=None) for some in (self.learnt, self.shown))
+        alone = own is not None and own.share > THRESHOLDS.shown_alone * (0.0 if force is None else force.share)
+        return own if alone else force
 
     @property
     def coherent(self) -> bool:
@@ -95,11 +97,9 @@ def _judged(long: Tangent, short: Tangent, seed: int) -> Left:
         own = {c: max(k.share * square, float(grown.excess[c])) for (c, square), k in zip(loud.items(), shown, strict=True)}
         own |= {c: square for c, square in loud.items() if square > THRESHOLDS.coarse_residual}
         share = max(share, *(_share(long, coordinates, size, c) for c, size in own.items()))
-        # What a law of one channel alone explains much better is no small force, which all channels would show.
-        forced = max((k.share for k in learnt), default=0.0)
-        if any(k.share > max(THRESHOLDS.learnt_plenty, THRESHOLDS.shown_alone * forced) for k in shown):
-            share = math.inf
     found = Left(long, short, grown, learnt, share, shown=shown)
+    if found.best in shown and found.coherent:
+        found = replace(found, share=math.inf)  # no small force makes it
     if not long.fitted.hypothesis.charged or (found.coherent and found.share > THRESHOLDS.faint_force):
         return found
     return replace(found, lack=lack(long, short, seed))
