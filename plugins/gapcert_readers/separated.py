@@ -49,9 +49,9 @@ def separated(path: Path) -> Any:
 def layout(path: Path) -> tuple[int, str]:
     """(how many lines stand above the header, what stands between the values).
 
-    The header and the lines below it have as many values as most lines have, by the mark that finds it first, and then by the
-    one that makes the most values; blanks stand beside other marks too. Lines that begin with # or % are remarks; the last one
-    is the header where numbers follow it.
+    The header and the lines below it have as many values as most lines have, and below other lines it is not of numbers alone;
+    where there is no such line, it is the first. The mark is the one that finds it first, or else makes the most values; blanks
+    stand beside other marks too. Lines that begin with # or % are remarks; the last one is the header where numbers follow it.
     """
     lines = [(n, line.strip("\r\n")) for n, line in enumerate(_text(path, THRESHOLDS.preamble_lines)) if line.strip()]
     first = next((i for i, (_, line) in enumerate(lines) if not _remark(line)), len(lines))
@@ -59,14 +59,15 @@ def layout(path: Path) -> tuple[int, str]:
     lines = lines[first - 1 if headed else first :]
     found = []
     for mark in MARKS:
-        counts = [len(_split(_bare(line), mark)) for _, line in lines]
-        usual = max(counts, key=counts.count, default=1)
-        starts = [i for i in range(len(counts) - 1) if set(counts[i : i + 3]) == {usual}]
-        if usual > 1 and starts:
-            found.append((mark == " ", starts[0], -usual, mark))
+        rows = [_split(_bare(line), mark) for _, line in lines]
+        counts = [len(row) for row in rows]
+        if (usual := max(counts, key=counts.count, default=1)) > 1:
+            starts = (i for i in range(len(counts) - 1) if set(counts[i : i + 3]) == {usual})
+            start = next((i for i in starts if not i or {"text", "none"} & set(map(_kind, rows[i]))), None)
+            found.append((mark == " ", start is None, start or 0, -usual, mark))
     if not found:
         return lines[0][0] if lines else 0, ","
-    _, start, _, mark = min(found)
+    *_, start, _, mark = min(found)
     return lines[start][0], mark
 
 

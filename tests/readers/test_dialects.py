@@ -82,6 +82,14 @@ def test_a_line_that_was_cut_off_is_still_told_below_a_preamble(tmp_path):
         inspect(tmp_path / "log.csv")
 
 
+@pytest.mark.parametrize("mark", [",", ";", "\t"])
+def test_rows_that_are_longer_than_the_header_are_told(tmp_path, mark):
+    text = mark.join(["t", "angle", "torque"]) + "\n" + rows(mark, end=f"{mark}0")
+    (tmp_path / "log.csv").write_text(text)
+    with pytest.raises(gc.UsageError, match=r"line 2 has 4 values .*; expected 3, as the header has"):
+        inspect(tmp_path / "log.csv")
+
+
 NAMED = ("turn", "pole", "hand", "m", "deg")
 
 
