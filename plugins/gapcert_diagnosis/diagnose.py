@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar, final
@@ -262,11 +263,18 @@ class _Data:
         fitted = library.measured
         held = replace(Dataset.of(model, with_past), sigma=fitted.sigma, spread=fitted.spread, since=since)
         _warned(problem.clock.emit, fitted, held)
-        assumed = kept_within(model, fitted, held)
+        assumed = (*kept_within(model, fitted, held), *_untried(library))
         windows = fitted.windows(_length(fitted, model, problem.window))
         windows = windows.thinned(THRESHOLDS.fitted_values, THRESHOLDS.guard_windows)
         stretches(held, problem.horizons)  # refuses before the search is paid for
         return cls(library, windows, held, assumed)
+
+
+def _untried(library: Library) -> Iterator[str]:
+    """Which effects need a position that the data do not show, in words."""
+    for site, group in itertools.groupby(sorted(library.aside, key=lambda c: c.site), key=lambda c: c.site):
+        names = ", ".join(c.effect.name for c in group)
+        yield f"effects that depend on where {site} is were not tried, as no output shows how it moves: {names}"
 
 
 def _warned(emit: Emit, fitted: Dataset, held: Dataset) -> None:

@@ -43,7 +43,8 @@ class Library:
     """Every effect at every site of a model, with scales from data; a set of causes becomes a Hypothesis.
 
     moves: what is added at once: an effect at a site, or the same effect at all its sites; seen: what shows in the measured
-    values alone, with its numbers, and needs no fit; measured: the data, with what is seen in the noise floor.
+    values alone, with its numbers, and needs no fit; measured: the data, with what is seen in the noise floor; aside: what
+    depends on a position that no output shows, or that never moves.
     """
 
     def __init__(self, model: Model, measured: Dataset, effects: Sequence[Effect]) -> None:
@@ -55,6 +56,8 @@ class Library:
         self._restatements: dict[Sequence[tuple[str, float]], Model] = {}
         self._path = np.concatenate(measured.states), np.concatenate(measured.inputs)
         every = [c for e in effects for s in model.sites(e.site) if self._possible(c := Candidate(e, s))]
+        self.aside = tuple(c for c in every if self._places(c) and not self.scales(c)["position_range"])
+        every = [c for c in every if c not in self.aside]
         self.candidates = tuple(c for c in every if not _reads(c.effect))
         self.seen = tuple((c, found) for c in every if (found := self._read(c)) is not None)
         for c, found in self.seen:
@@ -69,6 +72,11 @@ class Library:
         if not c.effect.applies(c.site, self.model):
             return False
         return self.extension(c).frees is None or self.loosened(c) is not None or self.doubted(c) is not None
+
+    def _places(self, c: Candidate) -> bool:
+        """Does what an effect does at a coordinate depend on where that is?"""
+        sized = any(name.startswith("position") for p in c.effect.parameters for name in p.dimension)
+        return c.effect.site == "coordinate" and (sized or "{q}" in (self.extension(c).force or ""))
 
     def _read(self, c: Candidate) -> dict[str, float] | None:
         if not _reads(c.effect):

@@ -1,0 +1,60 @@
+"""A state that no output shows: what depends on it is set aside, in words, and the rest is found as if it were not there."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+import gapcert as gc
+from gapcert.plugin import Recording, Trajectory
+
+H, N = 0.005, 2400
+NUMBERS = {"J": {"value": "0.002 kg*m^2", "tolerance": "5 %"}, "b": "0.004 N*m*s/rad", "k": "0.08 N*m/A"}
+FORMS = {
+    "coordinate": {
+        "coordinates": {"phi": "rad"},
+        "mass_matrix": [["J"]],
+        "forces": {"phi": "k*i - b*phi_dot"},
+        "outputs": {"phi_dot": "phi_dot"},
+    },
+    "rates": {
+        "states": {"phi": "rad", "w": "rad/s"},
+        "derivative": {"phi": "w", "w": "(k*i - b*w)/J"},
+        "outputs": {"w": "w"},
+    },
+    "alone": {"states": {"w": "rad/s"}, "derivative": {"w": "(k*i - b*w)/J"}, "outputs": {"w": "w"}},
+}
+
+
+@pytest.fixture(scope="module")
+def measured():
+    """(t, current, speed) of a drive with dry friction of 0.03 N·m, in small steps of another integrator."""
+    rng, w, speeds = np.random.default_rng(8), 0.0, []
+    current = rng.normal(size=N // 60).repeat(60) * 1.2
+    for i in current:
+        speeds.append(w)
+        for _ in range(20):
+            h, push = H / 20, 0.08 * i - 0.004 * w
+            free = w + h * push / 0.002
+            w = float(np.sign(free) * max(abs(free) - h * 0.03 / 0.002, 0.0))
+    return H * np.arange(N), current, np.array(speeds) + 0.02 * rng.normal(size=N)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_friction_is_found_without_the_angle(measured, form):
+    t, current, speed = measured
+    data = {"kind": "equations", "period": f"{H} s", "inputs": {"i": "A"}, "parameters": NUMBERS, **FORMS[form]}
+    model = gc.registry().build(
+        "model", "equations", gc.registry().config("model", "equations").model_validate(data), gc.Context(None)
+    )
+    (name,) = FORMS[form]["outputs"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        found = gc.diagnose(model, Recording((Trajectory(t, {name: speed, "i": current}, "log"),), {}, "zero"))
+    (cause,) = found.causes
+    level = cause.parameters["level"].value * (1.0 if form == "coordinate" else 0.002)
+    assert cause.effect == "coulomb-friction"
+    assert level == pytest.approx(0.03, rel=0.01)
+    told = [a for a in found.assumptions if "were not tried" in a]
+    assert bool(told) == (form != "alone")
+    assert all("dahl-friction" in a and "as no output shows how it moves" in a for a in told)
