@@ -57,9 +57,8 @@ def diagnose(
     pays for its parameters and for the number of rivals, and when a later stretch of the data agrees. The gain is measured by
     free rollouts over `hold_out` (default: the last quarter), which no fit has seen, at horizons in s (default: of one turn of
     the motion, and of three). experiment: what an experiment may do that tells apart what these data do not: `limits` of inputs
-    and outputs, `seconds`. train: the
-    trajectories that are fitted. A model for which there is a `diagnoser`, such as an engine in contact, which is rolled out
-    itself, is left to that; folder: keeps what an interrupted search goes on with.
+    and outputs, `seconds`. train: the trajectories that are fitted. A model for which there is a `diagnoser`, such as an engine
+    in contact, which is rolled out itself, is left to that; folder: keeps what an interrupted search goes on with.
     """
     clock = Clock(emit)
     _timed(model, recording, horizons)

@@ -44,6 +44,13 @@ def test_noise_and_missing_values_do_not_hide_the_motion():
     assert judged(recorded(noisy, seconds=80)) == pytest.approx((2, 6), rel=0.06)
 
 
+def test_times_that_are_missing_say_nothing():
+    recording = recorded(sine(2.0), seconds=80)
+    (tr,) = recording.trajectories
+    tr.t[[5, -1]] = np.nan
+    assert judged(recording) == pytest.approx((2, 6), rel=0.06)
+
+
 @pytest.mark.parametrize("seconds", [1.6, 3.0, 10.0])
 def test_short_logs_have_short_horizons_that_fit(seconds):
     recording = recorded(lambda t: t**2, seconds=seconds, samples=400)

@@ -26,7 +26,7 @@ def usual_horizons(recording: Recording, held_out: Recording, outputs: Sequence[
     """
     turns = [[_turn(tr, n) for tr in recording.trajectories] for n in outputs if n in recording.trajectories[0].channels]
     turn = max((float(np.median(t)) for t in turns), default=1.0)
-    room = max(float(tr.t[-1] - tr.t[0]) for tr in held_out.trajectories)
+    room = max(float(np.nanmax(tr.t) - np.nanmin(tr.t)) for tr in held_out.trajectories)
     # Two rollouts at least, each behind the stretch that its start is found in.
     longest = max((room - min(THRESHOLDS.rollout_leads[-1], room / 3)) / 2, THRESHOLDS.least_horizon * recording.period)
     return tuple(sorted({float(f"{min(h, longest):.3g}") for h in (turn, 3 * turn)}))
