@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeVar, final
+from typing import Any, Literal, TypeVar, final
 
 import numpy as np
 
@@ -164,19 +164,16 @@ class Clock:
 class Spared:
     """Runs what comes after the answer: what fails there costs its own part only, and is told in a sentence."""
 
-    PARTS: ClassVar = {"told_apart": "experiment", "figure": "pictures", "evidence": "tests of the residual"}
-
     def __init__(self) -> None:
         self.told: list[str] = []
 
-    def __call__(self, make: Callable[..., T], otherwise: U, *given: Any) -> T | U:
-        """`make(*given)`; UsageError passes, as it is about what was asked."""
+    def __call__(self, part: str, otherwise: U, make: Callable[..., T], *given: Any) -> T | U:
+        """`make(*given)`, or `otherwise` where it fails; UsageError passes, as it is about what was asked."""
         try:
             return make(*given)
         except UsageError:
             raise
         except Exception as error:  # a defect after the answer must not take it along
-            part = self.PARTS.get(getattr(make, "__name__", ""), "rest")
             self.told.append(
                 f"the {part} could not be made ({type(error).__name__}: {error}); please report it; the answer stands"
             )
@@ -207,7 +204,7 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
     dataset, asked = answer.dataset, problem.experiment
     limits = Limits.of(data.library.model, dataset, asked.get("limits"), asked.get("seconds", 12.0))
     spared = Spared()
-    design, _ = spared(told_apart, (None, ()), answer.causes, answer.fit, answer.ties, dataset, limits, seed)
+    design, _ = spared("experiment", (None, ()), told_apart, answer.causes, answer.fit, answer.ties, dataset, limits, seed)
     lap("experiment")
     left = leftover.left(data.library.extended(answer.causes, answer.fit.values), answer.fit, seed)
     doubted = doubt(answer.fit)
@@ -217,6 +214,7 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
     ties = [tuple(c.key for c in tie) for tie, _ in answer.ties]
     ties += [(("engine-setting", s.runner_up.setting),) for s in settings if s.runner_up and s.margin < THRESHOLDS.tie_score]
     rest = leftover.unexplained(left) if verdict == "unexplained" else None
+    correction = None if rest is None else rest.correction
     plain = None if answer.plain is None else (f"setting {' and '.join(s.variant.setting for s in settings)}", answer.plain)
     return Diagnosis(
         verdict,
@@ -227,9 +225,9 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
         tuple(ties),
         _experiment(answer, design is not None),
         rest,
-        spared(figure, None, answer.search, answer.causes, answer.fit, judge, design, rest.correction if rest else None, plain),
+        spared("pictures", None, figure, answer.search, answer.causes, answer.fit, judge, design, correction, plain),
         design=design,
-        evidence=spared(leftover.evidence, {}, left),
+        evidence=spared("tests of the residual", {}, leftover.evidence, left),
         negligible=tuple((*k, s) for k, s in answer.negligible.items() if k not in keys(answer.causes)),
         smallest=smallest(answer.search) if verdict == "nothing" else (),
         log={**dataset.log, "hold": dataset.hold or "undeclared"},

@@ -67,7 +67,7 @@ class Thresholds:
     restart_parts: tuple[int, ...] = chosen((8, 4, 2, 1), "of a window, in turn: a short head is found from any start")
     rollout_leads: tuple[float, ...] = chosen((0.03, 0.06, 0.12, 0.3), "s before a rollout that its start is fitted to")
     lead_samples: int = chosen(8, "at least: fewer do not average the noise of a start")
-    many_trajectories: int = chosen(8, "of which the last ones are held out whole, where nothing is said")
+    many_trajectories: int = chosen(8, "from which on the default holds out the last ones whole")
     turning_samples: int = chosen(1 << 16, "at most, in which it is looked for how long a motion takes to turn")
     least_horizon: int = chosen(4, "samples")
     rollout_starts: int = chosen(16, "at least over a held-out trajectory: a mean over fewer is chance")

@@ -6,6 +6,7 @@ import csv
 import io
 import itertools
 import re
+import statistics
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -49,7 +50,7 @@ def separated(path: Path) -> Any:
 def layout(path: Path) -> tuple[int, str]:
     """(how many lines stand above the header, what stands between the values).
 
-    The header and the lines below it have as many values as most lines have, and below other lines it is not of numbers alone;
+    The header and the lines below it have as many values as most lines have, and below other lines it has no numbers;
     where there is no such line, it is the first. The mark is the one that finds it first, or else makes the most values; blanks
     stand beside other marks too. Lines that begin with # or % are remarks; the last one is the header where numbers follow it.
     """
@@ -61,9 +62,9 @@ def layout(path: Path) -> tuple[int, str]:
     for mark in MARKS:
         rows = [_split(_bare(line), mark) for _, line in lines]
         counts = [len(row) for row in rows]
-        if (usual := max(counts, key=counts.count, default=1)) > 1:
+        if counts and (usual := statistics.mode(counts)) > 1:
             starts = (i for i in range(len(counts) - 1) if set(counts[i : i + 3]) == {usual})
-            start = next((i for i in starts if not i or {"text", "none"} & set(map(_kind, rows[i]))), None)
+            start = next((i for i in starts if not i or set(map(_kind, rows[i])) <= {"text", "none"}), None)
             found.append((mark == " ", start is None, start or 0, -usual, mark))
     if not found:
         return lines[0][0] if lines else 0, ","
@@ -156,13 +157,13 @@ def _parsed(data: Any, path: Path, mark: str, decimal: str) -> Any:
         kept = [i for i, n in enumerate(named) if n or not pyarrow.types.is_null(table.column(i).type)]
         return table.select(kept).rename_columns(_distinct([named[i] or f"column {i + 1}" for i in kept]))
 
-    def whole(**options: Any) -> Any:
+    def whole() -> Any:
         try:
-            return read(**options)
+            return read()
         except ArrowInvalid as error:
             if "conversion error" not in str(error):
                 raise
-            return read(block_size=min(max(path.stat().st_size, 1) + 1, LARGEST), **options)
+            return read(block_size=min(max(path.stat().st_size, 1) + 1, LARGEST))
 
     try:
         return whole()

@@ -53,7 +53,6 @@ def test_a_defect_after_the_answer_leaves_it_standing(whole, monkeypatch, name, 
     def broken(*given):
         raise ZeroDivisionError("no such thing")
 
-    broken.__name__ = name
     module = sys.modules["gapcert_diagnosis.diagnose"]
     owner = module.leftover if name == "evidence" else module
     monkeypatch.setattr(owner, name, broken)

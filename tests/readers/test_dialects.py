@@ -83,8 +83,9 @@ def test_a_line_that_was_cut_off_is_still_told_below_a_preamble(tmp_path):
 
 
 @pytest.mark.parametrize("mark", [",", ";", "\t"])
-def test_rows_that_are_longer_than_the_header_are_told(tmp_path, mark):
-    text = mark.join(["t", "angle", "torque"]) + "\n" + rows(mark, end=f"{mark}0")
+@pytest.mark.parametrize("last", ["0", "", "on"])
+def test_rows_that_are_longer_than_the_header_are_told(tmp_path, mark, last):
+    text = mark.join(["t", "angle", "torque"]) + "\n" + rows(mark, end=f"{mark}{last}")
     (tmp_path / "log.csv").write_text(text)
     with pytest.raises(gc.UsageError, match=r"line 2 has 4 values .*; expected 3, as the header has"):
         inspect(tmp_path / "log.csv")

@@ -56,7 +56,7 @@ def learn(motion: Tangent, site: str) -> Learnt:
 
 
 def learn_shown(motion: Tangent, channel: int) -> Learnt:
-    """Of the residual of one channel: what it shows beside its equation, which moves nothing."""
+    """Of the residual of one channel: what its output equation lacks, which changes no state."""
     found, name = {**input_features(motion), **_shown_features(motion)}, motion.windows.measured.channels[channel].name
     if name in (s.name for s in motion.model.states):
         del found["position memory"]  # the path of a state is as its own channel measured it, noise included

@@ -33,8 +33,8 @@ class Left:
     """The residual of a final model in long and short windows, and how it was judged.
 
     learnt: per coordinate; share: of the effort, the force that would leave as much; lack: what it goes with, though it may be
-    too little for the other tests, where something was fitted; shown: learnt per channel above its noise, of what it may show
-    beside its equation.
+    too little for the other tests, where something was fitted; shown: learnt per channel above its noise, of what its output
+    equation may lack.
     """
 
     long: Tangent
