@@ -26,8 +26,9 @@ from .fitting.fit import Fit, fit
 from .fitting.rollout_error import Stretches, stretches
 from .fitting.step_size import coarse
 from .residual import unexplained as leftover
+from .residual.adequacy import close
 from .results import Cause, Diagnosis, Estimate, Misfit, Rival
-from .search.alternatives import Answer, answered, flags, smallest
+from .search.alternatives import Answer, answered, decided, flags, smallest
 from .search.candidates import Candidate, Library
 from .search.criterion import keys, without
 from .search.engine_settings import Setting, across
@@ -194,7 +195,7 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
     # As the answer holds the inputs, and as its fit finds starts best.
     judges = stretches(replace(data.held, hold=answer.dataset.hold), problem.horizons, answer.fit)
     judge, settings = judges[-1], settled.settings
-    answer = _largest_first(answer, judge)
+    answer = _largest_first(decided(answer, judge), judge)
     named = tuple(_set(answer, s, judge) for s in settings) + tuple(_named(answer, c, judge) for c in answer.causes)
     named += tuple(_read(answer, c, numbers, judge) for c, numbers in answer.library.seen)
     lap("rivals")
@@ -209,7 +210,14 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
     left = leftover.left(data.library.extended(answer.causes, answer.fit.values), answer.fit, seed)
     doubted = doubt(answer.fit)
     undecided = design is not None or bool(answer.ties and spared.told)
-    verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, undecided, bool(doubted))
+    odd = bool(doubted and not named) or any(f.startswith("implausible") for c in named for f in c.flags)
+
+    def near(share: float) -> bool:
+        return close(judge, answer.fit, seed, share)
+
+    verdict = leftover.verdict(
+        len(named), left, answer.fit, answer.nothing, undecided, odd or bool(doubted and not named), near
+    )
     lap("leftover")
     ties = [tuple(c.key for c in tie) for tie, _ in answer.ties]
     ties += [(("engine-setting", s.runner_up.setting),) for s in settings if s.runner_up and s.margin < THRESHOLDS.tie_score]
@@ -256,7 +264,7 @@ class _Data:
     def of(cls, problem: DiagnosisProblem) -> _Data:
         """UsageError where they are too few, or in other terms."""
         model, (with_past, since) = problem.model, problem.recording.led_up(problem.held_out)
-        library = Library(model, Dataset.of(model, problem.fitted), problem.effects)
+        library = Library(model, Dataset.of(model, problem.fitted), problem.effects, max(problem.horizons))
         fitted = library.measured
         held = replace(Dataset.of(model, with_past), sigma=fitted.sigma, spread=fitted.spread, since=since)
         _warned(problem.clock.emit, fitted, held)
@@ -356,14 +364,14 @@ def _named(answer: Answer, c: Candidate, judge: Stretches) -> Cause:
 
 def _set(answer: Answer, s: Setting, judge: Stretches) -> Cause:
     """A setting of the engine: what it explains beside all other causes, refitted without it."""
-    h = Library(s.before.model, s.before.measured, []).hypothesis(answer.causes)
+    h = s.before.under(s.before.model).hypothesis(answer.causes)
     before = judge.error(fit(h, answer.fit.windows, theta=h.theta(answer.fit.values)))
     v, numbers = s.variant, dict[str, Estimate]()
     if isinstance(v.value, int | float) and not isinstance(v.value, bool):
         numbers["value"] = Estimate.of(float(v.value))
     rival = None
     if s.runner_up is not None:
-        other = fit(Library(s.runner_up.model, s.before.measured, []).hypothesis(()), answer.fit.windows)
+        other = fit(s.before.under(s.runner_up.model).hypothesis(()), answer.fit.windows)
         rival = Rival("engine-setting", s.runner_up.setting, _share(judge.error(other), before), s.margin, judge.rms(other))
     share = _share(judge.error(answer.fit), before)
     changed = {"value": v.value, "was": v.was}

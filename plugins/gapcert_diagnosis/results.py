@@ -232,7 +232,8 @@ class Diagnosis(Shown):
 
     def summary(self) -> dict[str, Any]:
         """As plain data; keys that do not apply are absent."""
-        out: dict[str, Any] = {"verdict": self.verdict, "causes": [_cause(c) for c in self.causes]}
+        part = {"partial": True} if self.verdict == "unexplained" else {}
+        out: dict[str, Any] = {"verdict": self.verdict, "causes": [_cause(c) | part for c in self.causes]}
         if self.ambiguous_with:
             out["ambiguous_with"] = [[{"effect": e, "site": s} for e, s in group] for group in self.ambiguous_with]
         out |= {k: v for k, v in (("seconds", self.seconds), ("experiment", self.experiment)) if v}

@@ -76,7 +76,7 @@ def test_noise_of_any_colour_is_nothing(colour, velocity):
         assert not found.remains
         assert found.growth.sigmas < 3.5
         assert all(k.share < leftover.THRESHOLDS.learnt_share for k in found.learnt)
-        assert leftover.verdict(0, found, last, last, experiment=False) == "nothing"
+        assert leftover.verdict(0, found, last, last, undecided=False, doubted=False, near=lambda share: True) == "nothing"
     # Against the white noise floor alone, coloured noise looks like something that grows.
     assert found.growth.chi_long > 1.06 * max(found.growth.chi_short, 1.0) or colour < 0.6
 
@@ -87,7 +87,7 @@ def test_a_missing_law_is_seen_through_the_noise(law, colour):
     found, last = left(recorded(truth(law), colour=colour))
     assert found.growth.sigmas > leftover.THRESHOLDS.growth_sigmas
     assert found.remains
-    assert leftover.verdict(0, found, last, last, experiment=False) == "unexplained"
+    assert leftover.verdict(0, found, last, last, undecided=False, doubted=False, near=lambda share: True) == "unexplained"
 
 
 def test_what_an_integrator_may_leave_is_seen_and_not_told():
@@ -173,13 +173,15 @@ def test_causes_that_leave_something_are_doubted():
     assert doubt.endswith("it looks like a law of the present state and input")
     assert leftover.doubts(3, found)[1].startswith("composite: 3 causes")
     nothing = replace(last, residual=5 * last.residual)
-    for causes, before, experiment, verdict in (
-        (0, last, False, "unexplained"),
-        (1, last, True, "unexplained"),
-        (1, nothing, False, "causes"),
-        (1, nothing, True, "ambiguous"),
+    for causes, before, undecided, doubted, close, verdict in (
+        (0, last, False, False, True, "unexplained"),
+        (1, last, True, False, True, "unexplained"),
+        (1, nothing, False, False, True, "causes"),
+        (1, nothing, False, True, True, "unexplained"),
+        (1, nothing, False, False, False, "unexplained"),
+        (1, nothing, True, False, True, "ambiguous"),
     ):
-        assert leftover.verdict(causes, found, last, before, experiment) == verdict
+        assert leftover.verdict(causes, found, last, before, undecided, doubted, lambda share, near=close: near) == verdict
 
 
 @pytest.mark.parametrize("colour", [0.0, 0.8])

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import final
 
 import numpy as np
+import numpy.typing as npt
 
 from gapcert.plugin import Array, UsageError, difference
 from gapcert_diagnosis.data.dataset import Dataset, Windows, once
@@ -45,9 +46,22 @@ class Stretches:
             )
         return cls(horizon, lead, held.windows(lead + length, max(1, min(length // 2, longest // THRESHOLDS.rollout_starts))))
 
+    @staticmethod
+    def fits(held: Dataset, horizon: float) -> bool:
+        """Do any of the data hold a rollout so long, behind the shortest lead?"""
+        room = max(len(y) - held.first(i) for i, y in enumerate(held.outputs))
+        return room - held.samples(horizon) >= THRESHOLDS.lead_samples
+
     def simulate(self, fitted: Fit) -> Array:
         """Outputs (W, H, ny) of free rollouts; each fit is rolled out once."""
-        return once(self._rolled, id(fitted), lambda: (fitted, *self._simulated(fitted)))[1]
+        return self._known(fitted)[1]
+
+    def start(self, fitted: Fit) -> Array:
+        """Where its rollouts begin, (W, nx)."""
+        return self._known(fitted)[2]
+
+    def _known(self, fitted: Fit) -> tuple[Fit, Array, Array]:
+        return once(self._rolled, id(fitted), lambda: (fitted, *self._simulated(fitted)))
 
     def _simulated(self, fitted: Fit) -> tuple[Array, Array]:
         """(outputs, starts); the search for starts begins where that of another fit ended, or at what was measured."""
@@ -64,9 +78,24 @@ class Stretches:
         seen = self.windows.weight[:, self.lead :]
         return np.asarray(np.sum(seen * error**2, axis=1) / np.maximum(np.sum(seen, axis=1), 1))
 
+    def blocks(self, fitted: Fit) -> Array:
+        """E² of stretches that share no data, or of the rollouts, where there is one such stretch."""
+        each, groups = np.mean(self.squares(fitted) / self.windows.measured.spread**2, axis=1), self._groups()
+        return np.asarray(np.bincount(groups, each) / np.bincount(groups))
+
+    def _groups(self) -> npt.NDArray[np.intp]:
+        w = self.windows
+        block = np.stack([w.trajectory, np.floor((w.t - w.t.min()) / self.horizon + 1e-9)], axis=-1)
+        groups = np.unique(block, axis=0, return_inverse=True)[1].ravel()
+        return groups if groups.max() else np.arange(len(w))
+
     def error(self, fitted: Fit) -> float:
         """E: root mean square over all channels, each divided by its standard deviation in the data."""
         return float(np.sqrt(np.mean(self.squares(fitted) / self.windows.measured.spread**2)))
+
+    def floors(self, fitted: Fit) -> Array:
+        """Root mean square error (ny,) in noise floors."""
+        return np.asarray(np.sqrt(np.mean(self.squares(fitted), axis=0)) / self.windows.measured.sigma)
 
     def rms(self, fitted: Fit) -> dict[str, float]:
         """Root mean square error per channel."""
@@ -76,11 +105,8 @@ class Stretches:
     def gains(self, before: Fit, after: Fit, seed: int) -> dict[str, Gain]:
         """Per channel. Overlapping rollouts are resampled together, so the interval does not count them twice."""
         old, new = self.squares(before), self.squares(after)
-        w = self.windows
-        block = np.stack([w.trajectory, np.floor((w.t - w.t.min()) / self.horizon + 1e-9)], axis=-1)
-        groups = np.unique(block, axis=0, return_inverse=True)[1].ravel()
-        if (count := int(groups.max()) + 1) < 2:
-            groups, count = np.arange(len(w)), len(w)
+        groups = self._groups()
+        count = int(groups.max()) + 1
         sums = np.stack([np.bincount(groups, column, count) for column in new.T], axis=-1)
         sizes = np.bincount(groups, minlength=count)
         drawn = np.random.default_rng(seed).integers(count, size=(THRESHOLDS.resamples, count))
@@ -88,7 +114,7 @@ class Stretches:
         low, high = np.sqrt(np.quantile(means, [0.025, 0.975], axis=0))
         rms = [np.sqrt(np.mean(a, axis=0)) for a in (old, new)]
         columns = np.stack([*rms, low, high])
-        return {c.name: Gain(*map(float, columns[:, i])) for i, c in enumerate(w.measured.channels)}
+        return {c.name: Gain(*map(float, columns[:, i])) for i, c in enumerate(self.windows.measured.channels)}
 
 
 def stretches(held: Dataset, horizons: Sequence[float], fitted: Fit | None = None) -> tuple[Stretches, ...]:

@@ -9,6 +9,7 @@ force.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -147,17 +148,23 @@ def _share(motion: Tangent, sites: tuple[str, ...], excess: float, channel: int 
     return min(shares)
 
 
-def verdict(causes: int, found: Left, last: Fit, nothing: Fit, experiment: bool, lost: bool = False) -> Verdict:
-    """causes: how many are named; nothing: the fit without them; experiment: can one tell the ties apart?
+def verdict(
+    causes: int, found: Left, last: Fit, nothing: Fit, undecided: bool, doubted: bool, near: Callable[[float], bool]
+) -> Verdict:
+    """causes: how many are named; nothing: the fit without them; undecided: are there rivals that an experiment tells apart?
 
-    Causes that leave a tenth of the excess over the noise are an answer even where something small is left beside them.
-    lost: nothing of the motion is followed, however little force would do so.
+    doubted: has a cause a number that is not plausible, or is nothing of the motion followed, however little force would do so?
+    near: are held-out rollouts within noise, or within such a share of the motion? Causes have to leave little, of the excess
+    over noise and of the motion, to be the answer where something is left beside them.
     """
-    if found.remains and not (causes and last.chi.mean() - 1 < THRESHOLDS.adequate_rest * (nothing.chi.mean() - 1)):
+    adequate = causes and last.chi.mean() - 1 < THRESHOLDS.adequate_rest * (nothing.chi.mean() - 1)
+    if doubted or (found.remains and not adequate):
+        return "unexplained"
+    if found.coherent and not last.windows.measured.exact and not near(THRESHOLDS.close_motion if causes else 0.0):
         return "unexplained"
     if not causes:
-        return "unexplained" if lost else "nothing"
-    return "ambiguous" if experiment else "causes"
+        return "nothing"
+    return "ambiguous" if undecided else "causes"
 
 
 def doubts(causes: int, found: Left) -> tuple[str, ...]:

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
 
 from gapcert_diagnosis.data.dataset import Dataset, Windows
 from gapcert_diagnosis.fitting.fit import Fit
+from gapcert_diagnosis.fitting.rollout_error import Stretches
 from gapcert_diagnosis.results import Seen
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Candidate, Causes, Library
-from .criterion import Found, fails, keys, rank, richer, without
+from .criterion import Found, ahead, fails, keys, rank, richer, without
 from .fitted_sets import FittedSets
 from .moves import additions, spared
 from .stepwise import judge
@@ -46,6 +47,14 @@ class Answer:
         """Of the windows, with the input held as fits best."""
         return self.fit.windows.measured
 
+    def with_answer(self, tie: Found) -> Answer:
+        """With one of the ties as the answer, and the answer as one of the ties."""
+        (new,), (old,), rivals = without(tie[0], self.causes), without(self.causes, tie[0]), dict(self.rivals)
+        others = [(self.causes, self.fit), *(f for f in rivals.pop(old.key) if keys(f[0]) != keys(tie[0]))]
+        rivals[new.key] = tuple(rank(others, self.search.cautious))
+        ties = ((self.causes, self.fit), *(t for t in self.ties if t is not tie))
+        return replace(self, causes=tuple(new if c is old else c for c in self.causes), fit=tie[1], ties=ties, rivals=rivals)
+
     @property
     def nothing(self) -> Fit:
         return self.search.nothing if self.plain is None else self.plain
@@ -63,13 +72,27 @@ def answered(search: FittedSets, found: Found, windows: Windows) -> Answer:
     rivals = {c.key: _alternatives(search, whole, found, c) for c in causes}
     ties = [t for t in _ties(whole, (causes, last), rivals) if not _refuted(search, t[0], found, later)]
     simplest = _simplest(whole, [(causes, last), *ties])
-    if simplest[0] == causes:
-        return Answer(whole, causes, last, tuple(ties), rivals, search.negligible)
-    (new,), (old,) = without(simplest[0], causes), without(causes, simplest[0])
-    rivals[new.key] = tuple(rank([(causes, last), *(f for f in rivals.pop(old.key) if f[0] != simplest[0])]))
-    others = [(causes, last), *(t for t in ties if t[0] != simplest[0])]
-    named = tuple(new if c is old else c for c in causes)
-    return Answer(whole, named, simplest[1], tuple(others), rivals, search.negligible)
+    answer = Answer(whole, causes, last, tuple(ties), rivals, search.negligible)
+    return answer if simplest[0] == causes else answer.with_answer(simplest)
+
+
+def decided(answer: Answer, judge: Stretches) -> Answer:
+    """As held-out data have it: a tie that foretells them plainly worse is none, one that does so plainly better is the answer,
+    and a rival that does is a tie."""
+    ties, judged = {keys(f[0]): f for f in answer.ties}, (judge.floors, judge.blocks)
+
+    def foretells(new: Fit, old: Fit) -> bool:
+        return ahead(*(ask(f) for ask in judged for f in (new, old)))
+
+    runners_up = [f for found in answer.rivals.values() for f in found[:1] if keys(f[0]) not in ties]
+    surprising = [f for f in runners_up if foretells(f[1], answer.fit)]
+    even = [f for f in answer.ties if not foretells(answer.fit, f[1])]
+    answer = replace(answer, ties=(*even, *surprising))
+    better = [f for f in even if foretells(f[1], answer.fit)]
+    if not better:
+        return answer
+    answer = answer.with_answer(min(better, key=lambda f: judge.error(f[1])))
+    return replace(answer, ties=tuple(f for f in answer.ties if not foretells(answer.fit, f[1])))
 
 
 def _refuted(search: FittedSets, causes: Causes, found: Found, later: Windows) -> bool:

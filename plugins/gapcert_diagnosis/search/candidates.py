@@ -44,11 +44,11 @@ class Library:
 
     moves: what is added at once: an effect at a site, or the same effect at all its sites; seen: what shows in the measured
     values alone, with its numbers, and needs no fit; measured: the data, with what is seen in the noise floor; aside: what
-    depends on a position that no output shows, or that never moves.
+    depends on a position that no output shows, or that never moves; horizon: in s, of the longest rollouts that matter.
     """
 
-    def __init__(self, model: Model, measured: Dataset, effects: Sequence[Effect]) -> None:
-        self.model, self.measured = model, measured
+    def __init__(self, model: Model, measured: Dataset, effects: Sequence[Effect], horizon: float = 0.0) -> None:
+        self.model, self.measured, self.horizon = model, measured, horizon
         self._extensions: dict[tuple[str, str], Extension] = {}
         self._scales: dict[tuple[str, str], dict[str, float]] = {}
         self._made: dict[tuple[tuple[str, str], ...], Hypothesis] = {}
@@ -64,6 +64,10 @@ class Library:
             self.measured = self._roughened(c, found)
         self._contains = {e.name: set(e.contains) for e in effects}
         self.moves = (*((c,) for c in self.candidates), *self._everywhere())
+
+    def under(self, model: Model, effects: Sequence[Effect] = ()) -> Library:
+        """Of another model, of the same data."""
+        return Library(model, self.measured, effects, self.horizon)
 
     def _possible(self, c: Candidate) -> bool:
         """Does the effect apply, can the data show it, and is there a tolerance that can be lifted?"""

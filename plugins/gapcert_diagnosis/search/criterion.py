@@ -8,6 +8,8 @@ squared residual of a channel over that of noise, G the charge for one more caus
 | `noise`        | a fit, the noise floor           | χ ≤ max(`noise_level`, 1 + chance) in all channels    | everyone       |
 | `pays`         | a set, one without some causes   | χ falls, ΔS > G; z > `sure_errors` if it falls little | steps, drops   |
 | `decides`      | a set, one without one cause     | χ > `plain_residual`² without it, most of that gone   | `matters`      |
+| `halves`       | rollouts with and without a cause | error > `loud_channel` without it, half with it      | `matters`      |
+| `ahead`        | two sets, on held-out data       | noise, beside no noise; or blocks agree by `surely`   | ties, rivals   |
 | `outdoes`      | a set, one on another path       | ΔS > 0; if it is larger ΔS > G, and it pays           | steps          |
 | `beats`        | two causes at once, single steps | ΔS > `tie_score`; ΔS > 0 if they are fewer            | pairs          |
 | `margin`       | a set, one with another law      | ΔS > ±`richer` by its numbers; as many: ±`tie_score`  | exchanges      |
@@ -28,6 +30,7 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
+from scipy.special import ndtr, stdtrit
 
 from gapcert.plugin import Array
 from gapcert_diagnosis.fitting.fit import Fit
@@ -94,6 +97,24 @@ def decides(whole: Fit, without: Fit) -> bool:
     """Is the residual plainly above the noise without a cause, and most of it gone with it?"""
     most = THRESHOLDS.little_force_share[whole.rough]
     return bool(((without.chi > THRESHOLDS.plain_residual**2) & (whole.chi < (1 - most) ** 2 * without.chi)).any())
+
+
+def halves(whole: Array, without: Array) -> bool:
+    """Is the error (ny,) of long rollouts, in noise floors, plainly above the noise without a cause, and half with it?"""
+    return bool(((without > THRESHOLDS.loud_channel) & (whole < THRESHOLDS.halved_error * without)).any())
+
+
+def ahead(floors: Array, others: Array, blocks: Array, other_blocks: Array) -> bool:
+    """Does one set foretell held-out data plainly better than another?
+
+    floors (ny,): errors of rollouts in noise floors; blocks (k,): E² of stretches that share no data. It does where its errors
+    are noise and the other's twice as much and none, or where the blocks' falls of ln E² are beyond chance (Student's t).
+    """
+    if (floors <= THRESHOLDS.loud_channel).all() and (others > np.maximum(THRESHOLDS.loud_channel, 2 * floors)).any():
+        return True
+    beyond = stdtrit(max(1, len(blocks) - 1), ndtr(THRESHOLDS.sure_errors))
+    less = blocks.mean() < THRESHOLDS.foretold_share**2 * other_blocks.mean()
+    return bool(less and agreement(np.log(other_blocks + 1e-300) - np.log(blocks + 1e-300)) > beyond)
 
 
 def outdoes(new: Fit, best: Fit, charge: float, rough: float | None = None, *, larger: bool) -> bool:

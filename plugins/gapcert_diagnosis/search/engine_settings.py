@@ -116,7 +116,7 @@ class _Settings:
 
     def under(self, variant: Variant) -> tuple[FittedSets, Found]:
         """The search under a setting."""
-        return search_windows(Library(variant.model, self.library.measured, self.effects), self.windows, self.tell)
+        return search_windows(self.library.under(variant.model, self.effects), self.windows, self.tell)
 
     def groups(self, alone: Sequence[Tried], found: Found) -> list[list[Tried]]:
         """Settings alone, in the place of one of several causes, and beside all where these leave something.
@@ -190,7 +190,7 @@ class _Settings:
 
     def bare(self, model: Model) -> Library:
         """For sets of causes under another model: it has candidates of its own only where it is searched."""
-        return once(self._bare, id(model), lambda: Library(model, self.library.measured, []))
+        return once(self._bare, id(model), lambda: self.library.under(model))
 
     def fitted(self, model: Model, causes: Causes, windows: Windows, start: Numbers) -> Fit:
         key = id(model), id(windows), tuple(c.key for c in causes), tuple(sorted(start.items()))

@@ -9,10 +9,11 @@ from typing import final
 
 from gapcert_diagnosis.data.dataset import Windows, once
 from gapcert_diagnosis.fitting.fit import Fit, carried, fit, rescued
+from gapcert_diagnosis.fitting.rollout_error import Stretches
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Candidate, Causes, Library
-from .criterion import Found, Keys, better, decides, keys, named, noise, pays, rough_charge
+from .criterion import Found, Keys, better, decides, halves, keys, named, noise, pays, rough_charge
 from .gains import Promise
 from .screening import Screen, standing_in
 
@@ -50,6 +51,14 @@ class FittedSets:
     @cached_property
     def screen(self) -> Screen:
         return Screen(self.library, self.windows, self.nothing, lambda text: self.progress(text, self._so_far(), fitted=False))
+
+    @cached_property
+    def far(self) -> Stretches | None:
+        """Rollouts of all fitted data over the longest horizon, where that is longer than a window."""
+        measured, horizon = self.windows.measured, self.library.horizon
+        if measured.samples(horizon) <= self.windows.length or not Stretches.fits(measured, horizon):
+            return None
+        return Stretches.of(measured, horizon)
 
     @cached_property
     def short(self) -> Windows:
@@ -191,14 +200,16 @@ class FittedSets:
     def matters(self, found: Found) -> bool:
         """Is every cause larger than what an integrator may leave, or than a stated tolerance? What is not, is noted.
 
-        Where almost nothing rubs, a thousandth of the effort may be all that is wrong: then it decides what windows look like.
+        Where almost nothing rubs, a thousandth of the effort may be all that is wrong: then it decides what windows look like,
+        or rollouts over the longest horizon.
         """
         small = {key: share for key, share in self.small(found).items() if not self.decides(found, key)}
         self.negligible |= small
         return not small
 
     def decides(self, found: Found, key: tuple[str, str]) -> bool:
-        return decides(found[1], self.fit(tuple(c for c in found[0] if c.key != key), found))
+        rest = self.fit(tuple(c for c in found[0] if c.key != key), found)
+        return decides(found[1], rest) or (self.far is not None and halves(*(self.far.floors(f) for f in (found[1], rest))))
 
 
 def _first_of(promised: Sequence[Promised], c: Candidate) -> Promise | None:

@@ -236,7 +236,9 @@ def experiment_sentence(design: Summary) -> str:
 
 
 def _unexplained(summary: Summary) -> str:
-    text = "Something is missing in the model that no effect in the library explains."
+    odd = any(f.startswith("implausible") for c in summary["causes"] for f in c.get("flags", ()))
+    lacks = "Something is missing in the model that no effect in the library explains"
+    text = f"{lacks} with plausible numbers." if odd else f"{lacks}."
     rest = summary.get("unexplained") or {}
     text += f" {said}" if (said := dependence(rest)) else ""
     if kinds := {k: v for k, v in rest.get("looks_like", {}).items() if v > 0.1}:
