@@ -26,12 +26,12 @@ from .fitting.fit import Fit, fit
 from .fitting.rollout_error import Stretches, stretches
 from .fitting.step_size import coarse
 from .residual import unexplained as leftover
-from .residual.adequacy import close
+from .residual.adequacy import blind, close
 from .results import Cause, Diagnosis, Estimate, Misfit, Rival
 from .search.alternatives import Answer, answered, decided, flags, smallest
 from .search.candidates import Candidate, Library
 from .search.criterion import keys, without
-from .search.engine_settings import Setting, across
+from .search.engine_settings import Setting, Settled, across
 
 T = TypeVar("T")
 U = TypeVar("U")
@@ -186,10 +186,10 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
     data, lap, seed = _Data.of(problem), problem.clock.lap, problem.seed
     lap("evidence")
 
-    settled = across(data.library, problem.effects, data.windows, problem.clock.tell)
+    settled, windows = _settled(data, problem)
     lap("search")
 
-    answer = answered(settled.search, settled.found, data.windows)
+    answer = answered(settled.search, settled.found, windows)
     if settled.settings:
         answer = replace(answer, plain=fit(data.library.hypothesis(()), answer.fit.windows))
     # As the answer holds the inputs, and as its fit finds starts best.
@@ -245,6 +245,24 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
         warnings=(*coarse(answer.fit), *spared.told),
         refitted=_refitted(answer),
     )
+
+
+def _settled(data: _Data, problem: DiagnosisProblem) -> tuple[Settled, Windows]:
+    """What a search found, and in which windows.
+
+    In longer ones where the usual ones are blind to what rollouts over the longest horizon show, and where it is found there.
+    """
+    first, tell = across(data.library, problem.effects, data.windows, problem.clock.tell), problem.clock.tell
+    judge, found, fitted = first.search.far, first.found[1], data.library.measured
+    if judge is None or problem.window is not None or fitted.exact or not blind(judge, found, problem.seed):
+        return first, data.windows
+    length = _length(fitted, problem.model, None, judge.horizon)
+    windows = fitted.windows(length).thinned(THRESHOLDS.fitted_values, THRESHOLDS.guard_windows)
+    if length < THRESHOLDS.longer_window * data.windows.length:
+        return first, data.windows
+    again = across(data.library, problem.effects, windows, tell)
+    one, two = (float(np.sum(np.maximum(judge.floors(f) ** 2 - 1, 0.0))) for f in (again.found[1], found))
+    return (again, windows) if one < THRESHOLDS.foretold_share**2 * two else (first, data.windows)
 
 
 @final
@@ -333,11 +351,13 @@ def _timed(model: Model, recording: Recording, horizons: Sequence[float] | None)
     agreeing(model, recording)
 
 
-def _length(measured: Dataset, model: Model, window: float | None) -> int:
+def _length(measured: Dataset, model: Model, window: float | None, wanted: float | None = None) -> int:
+    """In samples, as it is asked for, or `wanted` s (default: as usual) where the data are long enough for several such."""
     lengths = [len(y) - measured.history for y in measured.outputs]
-    usual = measured.samples(THRESHOLDS.window if len(model.coordinates) < 2 else THRESHOLDS.coupled_window)
+    usual = measured.samples(wanted or (THRESHOLDS.window if len(model.coordinates) < 2 else THRESHOLDS.coupled_window))
     if window is None:
-        return max(THRESHOLDS.usual_samples, min(usual, sum(lengths) // THRESHOLDS.usual_windows, min(lengths)))
+        count = THRESHOLDS.guard_windows if wanted else THRESHOLDS.usual_windows
+        return max(THRESHOLDS.usual_samples, min(usual, sum(lengths) // count, min(lengths)))
     if (own := measured.samples(window)) < THRESHOLDS.window_samples:
         raise UsageError(
             f"diagnose.window: {window:g} s hold {own} samples, {measured.period:g} s apart; expected "
@@ -405,7 +425,8 @@ def _numbers(library: Library, c: Candidate, last: Fit) -> dict[str, Estimate]:
 
 
 def _share(after: float, before: float) -> float:
-    return 1 - after / before if before > 0 else 0.0
+    """Of an error in deviations of the motion: one that runs away further says no more than 1."""
+    return 1 - after / min(before, 1.0) if before > 0 else 0.0
 
 
 def _misfits(answer: Answer) -> dict[str, Misfit]:

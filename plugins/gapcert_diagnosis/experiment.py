@@ -284,7 +284,9 @@ def _experiment(trial: _Trial, name: str, measured: Dataset) -> Experiment:
     inputs = {s.name: chosen.u[:, i] for i, s in enumerate(pair.here.hypothesis.model.inputs)}
     (a, b), (c, d) = pair.named, pair.other
     far, y = chosen.told, np.concatenate([_played(f, chosen.u[None], measured)[0] for f in (pair.here, pair.there)])
-    travel = {s.name: (float(y[:, i].min()), float(y[:, i].max()), s.unit) for i, s in enumerate(measured.channels)}
+    # What decays towards rest is told as rest.
+    ends = np.where(np.abs(y) < measured.sigma, 0.0, y)
+    travel = {s.name: (float(ends[:, i].min()), float(ends[:, i].max()), s.unit) for i, s in enumerate(measured.channels)}
     sentence = (
         f"to tell {a} at {b} from {c} at {d}: play {name} for {len(chosen.u) * measured.period:.3g} s; "
         f"their predictions then differ by {far:.2g} times the noise, by {math.sqrt(chosen.expected):.2g} sigma in all"

@@ -16,6 +16,8 @@ class Thresholds:
     coupled_window: float = decides(0.8, "s, several coordinates: as `window`, shorter since errors spread between them")
     fitted_values: int = decides(16_000, "measured values at most: more cost time, and say little new about causes")
     guard_windows: int = decides(4, "at least, among those that judge what the others suggest")
+    longer_window: float = chosen(1.5, "times the usual one, that a window must be to be worth another search")
+    longer_error: float = chosen(1.2, "of what noise makes of long rollouts, from which longer windows are tried")
     usual_samples: int = chosen(30, "in a window at least, before windows are made shorter to be more")
     usual_windows: int = chosen(8, "that a short recording is cut into: fewer cannot be resampled")
     input_sizes: tuple[float, ...] = chosen((1.0, 0.5, 0.25, 0.1), "of the limits, in turn until outputs stay within theirs")

@@ -26,6 +26,14 @@ def close(judge: Stretches, fitted: Fit, seed: int, share: float = 0.0) -> bool:
     return bool((near | (error <= limit * by_noise(judge, fitted, seed))).all())
 
 
+def blind(judge: Stretches, fitted: Fit, seed: int) -> bool:
+    """Do windows leave noise, and rollouts more than noise makes of them?"""
+    error, least = judge.floors(fitted), THRESHOLDS.longer_error
+    if (np.sqrt(fitted.chi) > THRESHOLDS.loud_channel).any() or (error <= least).all():
+        return False
+    return bool((error > least * by_noise(judge, fitted, seed)).any())
+
+
 def by_noise(judge: Stretches, fitted: Fit, seed: int) -> Array:
     """Root mean square error (ny,), in noise floors, of rollouts of a fit against itself, from starts that noise has moved and
     with numbers as uncertain as they are.

@@ -100,8 +100,10 @@ def decides(whole: Fit, without: Fit) -> bool:
 
 
 def halves(whole: Array, without: Array) -> bool:
-    """Is the error (ny,) of long rollouts, in noise floors, plainly above the noise without a cause, and half with it?"""
-    return bool(((without > THRESHOLDS.loud_channel) & (whole < THRESHOLDS.halved_error * without)).any())
+    """Is the error (ny,) of long rollouts, in noise floors, plainly above the noise without a cause, and half with it, noise
+    aside?"""
+    rest, before = whole**2 - 1, without**2 - 1
+    return bool(((without > THRESHOLDS.loud_channel) & (rest < THRESHOLDS.halved_error**2 * before)).any())
 
 
 def ahead(floors: Array, others: Array, blocks: Array, other_blocks: Array) -> bool:

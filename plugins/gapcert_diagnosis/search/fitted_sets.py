@@ -54,9 +54,9 @@ class FittedSets:
 
     @cached_property
     def far(self) -> Stretches | None:
-        """Rollouts of all fitted data over the longest horizon, where that is longer than a window."""
+        """Rollouts of all fitted data over the longest horizon, where that is longer than usual windows."""
         measured, horizon = self.windows.measured, self.library.horizon
-        if measured.samples(horizon) <= self.windows.length or not Stretches.fits(measured, horizon):
+        if horizon <= THRESHOLDS.window or not Stretches.fits(measured, horizon):
             return None
         return Stretches.of(measured, horizon)
 
