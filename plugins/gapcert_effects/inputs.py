@@ -10,7 +10,7 @@ from gapcert.plugin import EffectParameter, Extension, Memory, site_units
 from gapcert_effects.thresholds import THRESHOLDS
 
 from .experiments import BOTH_WAYS, FAST, FREE_DECAY, LEVELS, SECOND, SMALL_AND_LARGE
-from .law import NEVER, Law, spread
+from .law import NEVER, Law, spread, times
 
 
 def _lagging(target: str) -> tuple[str, str]:
@@ -19,6 +19,10 @@ def _lagging(target: str) -> tuple[str, str]:
     decay = "exp(-{h}/max({time_constant}, 0.001*{h}))"
     share = f"(1 - {decay})*{{time_constant}}/{{h}}"
     return f"{{memory}}*{share} + {target}*(1 - {share})", f"{{memory}}*{decay} + {target}*(1 - {decay})"
+
+
+def _time_constant(*starts: float) -> EffectParameter:
+    return EffectParameter("time_constant", {"period": 1}, starts, 0.0, float("inf"), longest=THRESHOLDS.slowest_lag)
 
 
 _MOVED = "min(max({u} - {memory}, -{rate}*{h}), {rate}*{h})"
@@ -32,7 +36,11 @@ class InputDelay(Law):
 
     name = "input-delay"
     site = "input"
-    parameters = (EffectParameter("delay", {"time": 1}, (0.003, 0.02, 0.05), 0.0, THRESHOLDS.latest_input),)
+    parameters = (
+        EffectParameter(
+            "delay", {"period": 1}, (0.6, 2.0, 5.0), 0.0, THRESHOLDS.latest_periods, longest=THRESHOLDS.latest_input
+        ),
+    )
     equation = "u(t − delay) acts"
     adds: ClassVar = {"delay": "{delay}"}
     signature = "the response to fast inputs lags, the response to slow ones is right"
@@ -43,7 +51,7 @@ class InputDelay(Law):
     rivals: ClassVar = {"input-lag": FAST, "sensor-delay": SECOND, "input-rate-limit": SMALL_AND_LARGE, "backlash": FAST}
 
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
-        return [(t,) for t in spread(min(0.5 * scales["period"], 0.01), 0.9 * THRESHOLDS.latest_input, 8)]
+        return [(t,) for t in times(self.parameters[0], scales)]
 
 
 @final
@@ -101,7 +109,7 @@ class InputRateLimitedLag(Law):
     site = "input"
     parameters = (
         EffectParameter("rate", {"input": 1, "time": -1}, (2.0, 10.0), 0.02, 2e4, off=NEVER),
-        EffectParameter("time_constant", {"time": 1}, (0.01, 0.05), 0.0, THRESHOLDS.slowest_lag),
+        _time_constant(2.0, 5.0),
     )
     equation = "r acts, ṙ = clip((u − r)/time_constant, ±rate)"
     signature = "large steps become ramps with a rounded end, small ones arrive rounded"
@@ -137,7 +145,7 @@ class InputLag(Law):
 
     name = "input-lag"
     site = "input"
-    parameters = (EffectParameter("time_constant", {"time": 1}, (0.005, 0.03, 0.1), 0.0, THRESHOLDS.slowest_lag),)
+    parameters = (_time_constant(1.0, 3.0, 10.0),)
     equation = "r acts, time_constant·ṙ = u − r"
     memory = Memory("{time_constant}_reached", "{input}", _ARRIVED[1])
     adds: ClassVar = {"input": _ARRIVED[0]}
@@ -148,7 +156,7 @@ class InputLag(Law):
     rivals: ClassVar = {"input-delay": FAST, "input-rate-limit": SMALL_AND_LARGE, "sensor-delay": FAST, "backlash": FREE_DECAY}
 
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
-        return [(t,) for t in spread(min(0.5 * scales["period"], 0.01), 0.7, 8)]
+        return [(t,) for t in times(self.parameters[0], scales, 0.3)]
 
 
 @final

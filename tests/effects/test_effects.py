@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar, final
 
+import numpy as np
 import pytest
 
 import gapcert as gc
@@ -19,9 +20,23 @@ ENGINES = {"contact-friction", "contact-restitution", "engine-setting"}
 
 
 def test_the_page_says_how_late_is_too_late():
-    delay, lag = (gc.registry().build("effect", n).parameters[0].high for n in ("input-delay", "input-lag"))
     page = " ".join((Path(__file__).parents[2] / "docs" / "effects.md").read_text().split())
-    assert f"Delays are looked for up to {delay:g} s, lags up to {lag:g} s" in page
+    shares = {"a tenth": 0.1, "a twentieth": 0.05, "lags up to all": 1.0}
+    late = [gc.registry().build("effect", n).parameters[0] for n in ("input-delay", "sensor-delay", "input-lag")]
+    for (said, share), p in zip(shares.items(), late, strict=True):
+        assert said in page
+        assert p.longest == share
+        assert p.high == float("inf") or f"(and {p.high:g} samples)" in page
+
+
+@pytest.mark.parametrize("period", [0.001, 0.1, 20.0])
+@pytest.mark.parametrize("name", ["input-delay", "input-lag", "sensor-delay"])
+def test_times_are_looked_for_on_the_scale_of_the_log(name, period):
+    effect, scales = gc.registry().build("effect", name), {"period": period, "duration": 800 * period}
+    (low, high), tried = effect.parameters[0].bounds(scales), np.array(effect.grid(scales))[:, 0]
+    assert low == 0 < tried[0] < period < 40 * period <= high <= 800 * period
+    assert tried[-1] < high
+    assert (tried[1:] / tried[:-1] < 2).all()
 
 
 @pytest.mark.contract

@@ -105,7 +105,16 @@ class Library:
         return 12 + 2 * math.log(max(1, len(self.candidates) + settings))
 
     def extension(self, c: Candidate) -> Extension:
-        return once(self._extensions, c.key, lambda: c.effect.extension(c.site, self.model))
+        return once(self._extensions, c.key, lambda: self._extension(c))
+
+    def _extension(self, c: Candidate) -> Extension:
+        """What remembers as long as its bounds allow has those of the data."""
+        e = c.effect.extension(c.site, self.model)
+        if e.delay is None:
+            return e
+        own = (p.bounds(self.scales(c)) for p in c.effect.parameters)
+        numbers = (replace(p, low=low, high=high) for p, (low, high) in zip(e.parameters, own, strict=True))
+        return replace(e, parameters=tuple(numbers))
 
     def freed(self, c: Candidate) -> Parameter | None:
         """The parameter of the model that a candidate frees, as it is stated; None of a law, which has numbers of its own."""
@@ -195,7 +204,7 @@ class Library:
             ends = stated.value - THRESHOLDS.doubt_reach * doubt, stated.value + THRESHOLDS.doubt_reach * doubt
             return np.array([max(ends[0], stated.low)]), np.array([min(ends[1], stated.high)])
         scale = np.array([p.scale(self.scales(c)) for p in c.effect.parameters])
-        low, high = (np.array([getattr(p, n) for p in c.effect.parameters]) * scale for n in ("low", "high"))
+        low, high = np.array([p.bounds(self.scales(c)) for p in c.effect.parameters]).T
         if stated is not None:
             low, high = np.sort([stated.value * low / scale, stated.value * high / scale], axis=0)
             if stated.low < 0:  # A place, or a component, may have either sign.
