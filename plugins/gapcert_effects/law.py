@@ -36,7 +36,7 @@ class Law(Effect):
 
     def __init_subclass__(cls) -> None:
         if "sentence" not in vars(cls):
-            cls.sentence = SENTENCES.get(getattr(cls, "name", ""), "")
+            cls.sentence = SENTENCES.get(cls.variant_of or getattr(cls, "name", ""), "")
 
     def applies(self, site: str, model: gc.Model) -> bool:
         return all(holds(site, model) for holds in self.where)

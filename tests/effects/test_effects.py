@@ -16,6 +16,7 @@ from gapcert_effects.plugin import HOMES
 
 NAMES = [name for effects in HOMES.values() for name in effects if not name.startswith("contact-")]
 CHECKS = [c for c in dir(EffectContract) if c.startswith("test_")]
+VARIANTS = [form for name in NAMES for form in gc.registry().build("effect", name).variants]
 ENGINES = {"contact-friction", "contact-restitution", "engine-setting"}
 
 
@@ -40,11 +41,11 @@ def test_times_are_looked_for_on_the_scale_of_the_log(name, period):
 
 
 @pytest.mark.contract
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, *(form.name for form in VARIANTS)])
 def test_keeps_the_contract(name):
     class Contract(EffectContract):
         def effect(self):
-            return gc.registry().build("effect", name)
+            return next((form() for form in VARIANTS if form.name == name), None) or gc.registry().build("effect", name)
 
     contract = Contract()
     for check in CHECKS:
@@ -60,6 +61,16 @@ def test_is_declared_under_its_name(name):
     for others in (effect.rivals, effect.contains, effect.equivalent):
         assert set(others) <= set(NAMES) - {name}
         assert all(others.values())
+
+
+def test_other_forms_of_a_cause_are_named_as_it_is():
+    for name in NAMES:
+        effect = gc.registry().build("effect", name)
+        for form in effect.variants:
+            assert form.name.startswith(f"{name}-")
+            assert (form.variant_of, form.site, form.stage, form.family) == (name, effect.site, effect.stage, effect.family)
+            assert form.sentence == effect.sentence
+            assert set(form.rivals) <= set(NAMES)
 
 
 def test_every_name_of_the_contract_is_there():

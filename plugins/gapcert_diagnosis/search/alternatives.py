@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
@@ -64,12 +64,26 @@ def answered(search: FittedSets, found: Found, windows: Windows) -> Answer:
     ties = [t for t in _ties(whole, (causes, last), rivals) if not _refuted(search, t[0], found, later)]
     simplest = _simplest(whole, [(causes, last), *ties])
     if simplest[0] == causes:
-        return Answer(whole, causes, last, tuple(ties), rivals, search.negligible)
+        return _told(Answer(whole, causes, last, tuple(ties), rivals, search.negligible))
     (new,), (old,) = without(simplest[0], causes), without(causes, simplest[0])
     rivals[new.key] = tuple(rank([(causes, last), *(f for f in rivals.pop(old.key) if f[0] != simplest[0])]))
     others = [(causes, last), *(t for t in ties if t[0] != simplest[0])]
     named = tuple(new if c is old else c for c in causes)
-    return Answer(whole, named, simplest[1], tuple(others), rivals, search.negligible)
+    return _told(Answer(whole, named, simplest[1], tuple(others), rivals, search.negligible))
+
+
+def _told(answer: Answer) -> Answer:
+    """Without what differs from the causes, or from one before it, in the form of a law only."""
+
+    def differ(found: Sequence[Found]) -> tuple[Found, ...]:
+        seen, kept = {frozenset(c.told for c in answer.causes)}, list[Found]()
+        for f in found:
+            if (names := frozenset(c.told for c in f[0])) not in seen:
+                seen.add(names)
+                kept.append(f)
+        return tuple(kept)
+
+    return replace(answer, ties=differ(answer.ties), rivals={k: differ(found) for k, found in answer.rivals.items()})
 
 
 def _refuted(search: FittedSets, causes: Causes, found: Found, later: Windows) -> bool:
@@ -188,8 +202,8 @@ def smallest(search: FittedSets) -> tuple[Seen, ...]:
     """What each effect would have had to be, to be named in these data."""
     library, out = search.library, []
     (table,) = search.screen.tables([(search.nothing, 1)])
-    for c in library.candidates:
+    for c in (c for c in library.candidates if not c.effect.variant_of):
         (low, high), row = library.bounds(c), table.least(c, library.charge())
         if row is not None and (row >= low).all() and (row <= high).all():
-            out.append(Seen(*c.key, c.effect.parameters[0].name, float(row[0]), library.units(c)[0]))
+            out.append(Seen(*c.told, c.effect.parameters[0].name, float(row[0]), library.units(c)[0]))
     return tuple(out)

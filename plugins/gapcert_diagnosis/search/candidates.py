@@ -34,6 +34,11 @@ class Candidate:
     def key(self) -> tuple[str, str]:
         return self.effect.name, self.site
 
+    @property
+    def told(self) -> tuple[str, str]:
+        """The name that is reported, and the site."""
+        return self.effect.variant_of or self.effect.name, self.site
+
 
 Causes = tuple[Candidate, ...]
 
@@ -55,6 +60,7 @@ class Library:
         self._models: dict[tuple[Sequence[tuple[str, str]], Sequence[tuple[str, float]]], Model] = {}
         self._restatements: dict[Sequence[tuple[str, float]], Model] = {}
         self._path = np.concatenate(measured.states), np.concatenate(measured.inputs)
+        effects = [v for e in effects for v in (e, *(form() for form in e.variants))]
         every = [c for e in effects for s in model.sites(e.site) if self._possible(c := Candidate(e, s))]
         self.aside = tuple(c for c in every if self._places(c) and not self.scales(c)["position_range"])
         every = [c for c in every if c not in self.aside]
@@ -143,13 +149,13 @@ class Library:
         return other in direct or any(self.contains(d, other) for d in direct)
 
     def related(self, a: Candidate, b: Candidate) -> bool:
-        """At one site, is one law a special case of the other?"""
+        """At one site, is one law a special case of the other, or another form of it?"""
         one, two = a.effect.name, b.effect.name
-        return a.site == b.site and (one == two or self.contains(one, two) or self.contains(two, one))
+        return a.told == b.told or (a.site == b.site and (self.contains(one, two) or self.contains(two, one)))
 
     def simplicity(self, causes: Causes) -> tuple[int, list[int]]:
         """Fewest numbers first, then the order of the contract."""
-        order = [ORDER.index(c.effect.name) if c.effect.name in ORDER else len(ORDER) for c in causes]
+        order = [ORDER.index(c.told[0]) if c.told[0] in ORDER else len(ORDER) for c in causes]
         return sum(len(c.effect.parameters) for c in causes), sorted(order)
 
     def scales(self, c: Candidate) -> dict[str, float]:

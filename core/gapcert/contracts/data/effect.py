@@ -65,7 +65,8 @@ class Effect(ABC):
     limit); family: effects of one family look alike, and screening lets the best of each family through; contains: name of a
     simpler effect → how its parameters become mine, {my parameter: its parameter} (mine that are not mentioned keep their
     start); equivalent: name of an effect that is the same on some excitation → which; stage: the order along an input's
-    path, small ones nearer to the command.
+    path, small ones nearer to the command; variants: other forms of the same cause, with numbers of their own, that are tried
+    beside it; variant_of: under whose name such a form is reported.
     """
 
     name: str
@@ -81,6 +82,8 @@ class Effect(ABC):
     contains: ClassVar[Mapping[str, Mapping[str, str]]] = {}
     equivalent: ClassVar[Mapping[str, str]] = {}
     stage: int = 0
+    variants: ClassVar[tuple[type[Effect], ...]] = ()
+    variant_of: str = ""
 
     def applies(self, site: str, model: Model) -> bool:
         """Can it act at this site of this model? Sites where it cannot are left out of a search."""
