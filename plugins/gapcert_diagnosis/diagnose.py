@@ -30,7 +30,7 @@ from .residual.adequacy import blind, close
 from .results import Cause, Diagnosis, Estimate, Misfit, Rival
 from .search.alternatives import Answer, answered, decided, flags, smallest
 from .search.candidates import Candidate, Library
-from .search.criterion import keys, without
+from .search.criterion import without
 from .search.engine_settings import Setting, Settled, across
 
 T = TypeVar("T")
@@ -215,11 +215,9 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
     def near(share: float) -> bool:
         return close(judge, answer.fit, seed, share)
 
-    verdict = leftover.verdict(
-        len(named), left, answer.fit, answer.nothing, undecided, odd or bool(doubted and not named), near
-    )
+    verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, undecided, odd, near)
     lap("leftover")
-    ties = [tuple(c.key for c in tie) for tie, _ in answer.ties]
+    ties = [tuple(c.told for c in tie) for tie, _ in answer.ties]
     ties += [(("engine-setting", s.runner_up.setting),) for s in settings if s.runner_up and s.margin < THRESHOLDS.tie_score]
     rest = leftover.unexplained(left) if verdict == "unexplained" else None
     correction = None if rest is None else rest.correction
@@ -236,7 +234,7 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
         spared("pictures", None, figure, answer.search, answer.causes, answer.fit, judge, design, correction, plain),
         design=design,
         evidence=spared("tests of the residual", {}, leftover.evidence, left),
-        negligible=tuple((*k, s) for k, s in answer.negligible.items() if k not in keys(answer.causes)),
+        negligible=_negligible(answer),
         smallest=smallest(answer.search) if verdict == "nothing" else (),
         log={**dataset.log, "hold": dataset.hold or "undeclared"},
         assumptions=(*data.assumptions, *doubted),
@@ -296,7 +294,7 @@ class _Data:
 def _untried(library: Library) -> Iterator[str]:
     """Which effects need a position that the data do not show, in words."""
     for site, group in itertools.groupby(sorted(library.aside, key=lambda c: c.site), key=lambda c: c.site):
-        names = ", ".join(c.effect.name for c in group)
+        names = ", ".join(dict.fromkeys(c.told[0] for c in group))
         yield f"effects that depend on where {site} is were not tried, as no output shows how it moves: {names}"
 
 
@@ -375,11 +373,11 @@ def _named(answer: Answer, c: Candidate, judge: Stretches) -> Cause:
     for rival, fitted in answer.rivals[c.key][:1]:
         other = without(rival, without(answer.causes, (c,)))[0]
         runner_up = Rival(
-            *other.key, _share(judge.error(fitted), before), answer.search.better(last, fitted), judge.rms(fitted)
+            *other.told, _share(judge.error(fitted), before), answer.search.better(last, fitted), judge.rms(fitted)
         )
     share = _share(judge.error(last), before)
-    native = library.model.native(*c.key)
-    return Cause(*c.key, _numbers(library, c, last), share, runner_up, native, flags(library, c, last))
+    native = library.model.native(*c.told)
+    return Cause(*c.told, _numbers(library, c, last), share, runner_up, native, flags(library, c, last))
 
 
 def _set(answer: Answer, s: Setting, judge: Stretches) -> Cause:
@@ -407,7 +405,7 @@ def _read(answer: Answer, c: Candidate, numbers: Mapping[str, float], judge: Str
     left = max(0.0, before - m.sigma[channel] ** 2 / m.spread[channel] ** 2 / len(m.channels))
     rows = zip(library.parameters(c).items(), library.units(c), strict=True)
     known = {p.name: Estimate.of(numbers[n], unit=unit) for (n, p), unit in rows}
-    return Cause(*c.key, known, _share(math.sqrt(left), math.sqrt(before)))
+    return Cause(*c.told, known, _share(math.sqrt(left), math.sqrt(before)))
 
 
 def _extended(answer: Answer) -> Model:
@@ -415,6 +413,12 @@ def _extended(answer: Answer) -> Model:
     for _, found in library.seen:
         numbers |= found
     return library.extended((*answer.causes, *(c for c, _ in library.seen)), numbers)
+
+
+def _negligible(answer: Answer) -> tuple[tuple[str, str, float], ...]:
+    named, told = {c.told for c in answer.causes}, {c.key: c.told for c in answer.library.candidates}
+    shares = {told[k]: share for k, share in answer.negligible.items() if told[k] not in named}
+    return tuple((*site, share) for site, share in shares.items())
 
 
 def _numbers(library: Library, c: Candidate, last: Fit) -> dict[str, Estimate]:
@@ -439,9 +443,9 @@ def _experiment(answer: Answer, separable: bool) -> str | None:
     """What would tell the first tie apart; of what no input separates, what to measure besides, where sites differ."""
     for tie, _ in answer.ties:
         a, b = without(answer.causes, tie)[0], without(tie, answer.causes)[0]
-        known = a.effect.rivals.get(b.effect.name) or b.effect.rivals.get(a.effect.name)
+        known = a.effect.rivals.get(b.told[0]) or b.effect.rivals.get(a.told[0])
         text = known or f"{a.effect.experiment}; {b.effect.experiment}"
         if not separable and a.site != b.site:
             text = f"measure {', or '.join(_MEASURED.get(c.effect.site, '{} by itself').format(c.site) for c in (a, b))}"
-        return f"to tell {a.effect.name} at {a.site} from {b.effect.name} at {b.site}: {text}"
+        return f"to tell {a.told[0]} at {a.site} from {b.told[0]} at {b.site}: {text}"
     return None

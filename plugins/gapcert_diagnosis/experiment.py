@@ -114,7 +114,7 @@ def told_apart(
     """`design` for a set of causes and the other sets that explain the data as well."""
     pairs = []
     for tie, fitted in ties:
-        mine, other = {c.key for c in causes}, {c.key for c in tie}
+        mine, other = {c.told for c in causes}, {c.told for c in tie}
         a, b = next(iter(sorted(mine - other)), min(mine)), next(iter(sorted(other - mine)), min(other))
         pairs.append(Rivalry(a, b, last, fitted))
     return design(pairs, measured, limits, last.residual.shape[1], seed)

@@ -52,7 +52,7 @@ def figure(
     steps = [(causes, last)]
     while rest := steps[0][0]:
         steps.insert(0, (rest[:-1], search.fit(rest[:-1], steps[0])))
-    named = [called(*c[-1].key) for c, _ in steps[1:]]
+    named = [called(*c[-1].told) for c, _ in steps[1:]]
     fits = [f for _, f in steps]
     if plain is not None:
         named, fits = [plain[0], *named], [plain[1], *fits]
@@ -354,7 +354,7 @@ def _law(path: _Fitted, place: _Place, group: Causes, axis: _Axis, law: Array) -
     at, line = (np.empty(0), np.empty(0)) if not group else _drawn(shape, axis.values[rows], law[rows])
     reach = max(3 * float(np.median(half)), THRESHOLDS.wide_interval * float(np.ptp(law)) if group else 0.0)
     keep = (half <= reach) & (label < 2 * THRESHOLDS.quantity_intervals)
-    names = " and ".join(called(*c.key).removesuffix(f" at {place.site}") for c in group)
+    names = " and ".join(called(*c.told).removesuffix(f" at {place.site}") for c in group)
     title = f"{names or 'what is left'} at {place.site}"
     up = (label[keep] >= THRESHOLDS.quantity_intervals).astype(np.float64) if shape == "loop" else np.empty(0)
     return Law(title, axis.label, place.label, x[keep], y[keep], at, line, half[keep], up, shape)
@@ -397,5 +397,5 @@ def _outputs(path: _Fitted) -> tuple[Law, ...]:
         shape = "line" if _carried(law, axis) >= THRESHOLDS.carrying_share else "loop"
         y, mid = _means(law + left, member, len(sizes)), _means(true, member, len(sizes))
         label = f"added to the reading [{m.channels[i].unit}]"
-        drawn.append(Law(called(*c.key), axis.label, label, mid, y, *_drawn(shape, true, law), half, shape=shape))
+        drawn.append(Law(called(*c.told), axis.label, label, mid, y, *_drawn(shape, true, law), half, shape=shape))
     return tuple(drawn)

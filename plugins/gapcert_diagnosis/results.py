@@ -16,9 +16,9 @@ Verdict = Literal["causes", "ambiguous", "nothing", "unexplained"]
 _ORDER = """
 viscous-friction coulomb-friction stribeck-friction lugre-friction dahl-friction quadratic-drag
 load-dependent-friction asymmetric-coulomb-friction asymmetric-viscous-friction linear-spring cubic-spring
-constant-force gravity-tilt cogging payload joint-coupling backlash external-push wheel-slip parameter
+constant-force gravity-tilt cogging payload joint-coupling backlash external-push parameter
 contact-friction contact-restitution engine-setting input-gain input-offset input-dead-zone input-saturation
-input-delay input-lag input-rate-limit input-rate-limited-lag supply-sag sensor-bias sensor-scale sensor-delay
+wheel-slip input-delay input-lag input-rate-limit input-rate-limited-lag supply-sag sensor-bias sensor-scale sensor-delay
 sensor-quantisation
 """
 ORDER = tuple(_ORDER.split())

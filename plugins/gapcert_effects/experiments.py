@@ -12,6 +12,7 @@ PLACES = "hold still at several places over the whole range: the laws differ in 
 FREE_DECAY = "release it far from rest, without input, and let it swing out"
 FAST = "play fast inputs, steps or a chirp up to the bandwidth: the phase of a delay falls in proportion to the frequency"
 SMALL_AND_LARGE = "play one signal small, then large: a limit shows in the large one only, a dead zone in the small one"
+REVERSALS = "reverse the input away from zero: play stays there, a dead zone does not"
 SECOND = "measure a second output beside this one: a late input shows in both, a late sensor in one"
 SHAKE_AND_HOLD = "shake it fast, then hold it still at several places: inertia shows in the one, weight in the other"
 SLIDE = "let the body slide to rest on a level surface, from several speeds and on several of its faces"

@@ -10,7 +10,7 @@ import gapcert as gc
 from gapcert.plugin import EffectParameter, Extension, Memory
 from gapcert_effects.thresholds import THRESHOLDS
 
-from .experiments import BOTH_WAYS, FREE_DECAY, LEVELS, PLACES, SHAKE_AND_HOLD, SMALL_AND_LARGE, VARY_SPEED
+from .experiments import BOTH_WAYS, FREE_DECAY, LEVELS, PLACES, REVERSALS, SHAKE_AND_HOLD, SMALL_AND_LARGE, VARY_SPEED
 from .law import NEVER, Law, carries, driven, moves, neighbour, placed, spread, straight, tilts
 
 
@@ -181,7 +181,7 @@ class Backlash(Law):
     family = "play"
     stage = 1
     rivals: ClassVar = {
-        "input-dead-zone": "reverse the input away from zero: play stays there, a dead zone does not",
+        "input-dead-zone": REVERSALS,
         "input-lag": "reverse slowly, then fast: the width of the loop is that of play at any speed",
         "input-delay": "reverse slowly, then fast: the width of the loop is that of play at any speed",
         "coulomb-friction": FREE_DECAY,
@@ -204,6 +204,7 @@ class WheelSlip(Law):
     experiment = SMALL_AND_LARGE
     family = "limit"
     stage = 2
+    equivalent: ClassVar = {"input-saturation": "where one input is the force that the ground takes"}
     rivals: ClassVar = {"input-saturation": SMALL_AND_LARGE, "input-gain": LEVELS, "quadratic-drag": FREE_DECAY}
 
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:

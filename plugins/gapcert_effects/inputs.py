@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from typing import ClassVar, final
 
@@ -9,8 +10,8 @@ import gapcert as gc
 from gapcert.plugin import EffectParameter, Extension, Memory, site_units
 from gapcert_effects.thresholds import THRESHOLDS
 
-from .experiments import BOTH_WAYS, FAST, FREE_DECAY, LEVELS, SECOND, SMALL_AND_LARGE
-from .law import NEVER, Law, spread
+from .experiments import BOTH_WAYS, FAST, FREE_DECAY, LEVELS, REVERSALS, SECOND, SMALL_AND_LARGE
+from .law import NEVER, Law, spread, times
 
 
 def _lagging(target: str) -> tuple[str, str]:
@@ -19,6 +20,19 @@ def _lagging(target: str) -> tuple[str, str]:
     decay = "exp(-{h}/max({time_constant}, 0.001*{h}))"
     share = f"(1 - {decay})*{{time_constant}}/{{h}}"
     return f"{{memory}}*{share} + {target}*(1 - {share})", f"{{memory}}*{decay} + {target}*(1 - {decay})"
+
+
+def _kept(text: str) -> str:
+    """Its placeholders pass one more round of formatting."""
+    return text.replace("{", "{{").replace("}", "}}")
+
+
+def _edge(name: str) -> EffectParameter:
+    return EffectParameter(name, {"input_peak": 1}, (0.05, 0.3), -0.6, 1.0)
+
+
+def _time_constant(*starts: float, name: str = "time_constant") -> EffectParameter:
+    return EffectParameter(name, {"period": 1}, starts, 0.0, float("inf"), longest=THRESHOLDS.slowest_lag)
 
 
 _MOVED = "min(max({u} - {memory}, -{rate}*{h}), {rate}*{h})"
@@ -32,7 +46,11 @@ class InputDelay(Law):
 
     name = "input-delay"
     site = "input"
-    parameters = (EffectParameter("delay", {"time": 1}, (0.003, 0.02, 0.05), 0.0, THRESHOLDS.latest_input),)
+    parameters = (
+        EffectParameter(
+            "delay", {"period": 1}, (0.6, 2.0, 5.0), 0.0, THRESHOLDS.latest_periods, longest=THRESHOLDS.latest_input
+        ),
+    )
     equation = "u(t − delay) acts"
     adds: ClassVar = {"delay": "{delay}"}
     signature = "the response to fast inputs lags, the response to slow ones is right"
@@ -43,7 +61,29 @@ class InputDelay(Law):
     rivals: ClassVar = {"input-lag": FAST, "sensor-delay": SECOND, "input-rate-limit": SMALL_AND_LARGE, "backlash": FAST}
 
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
-        return [(t,) for t in spread(min(0.5 * scales["period"], 0.01), 0.9 * THRESHOLDS.latest_input, 8)]
+        return [(t,) for t in times(self.parameters[0], scales)]
+
+
+@final
+class UnevenDeadZone(Law):
+    """u acts as u − clip(u, −w₋, w₊); an edge below zero lies on the other side of it."""
+
+    name = "input-dead-zone-uneven"
+    variant_of = "input-dead-zone"
+    site = "input"
+    parameters = (_edge("minus"), _edge("plus"))
+    equation = "u − clip(u, −minus, plus) acts"
+    adds: ClassVar = {"input": "{u} - min(max({u}, -{minus}), {plus})"}
+    signature = "small inputs do nothing, in one direction up to a larger one than in the other"
+    experiment = SMALL_AND_LARGE
+    family = "dead-zone"
+    stage = 20
+    contains: ClassVar = {"input-dead-zone": {"minus": "width", "plus": "width"}}
+    rivals: ClassVar = {"input-offset": SMALL_AND_LARGE, "backlash": REVERSALS}
+
+    def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
+        edges, sides = spread(0.05, 1.0, 5), ((1.0, 1.0), (1.0, 0.3), (0.3, 1.0), (1.0, 0.0), (0.0, 1.0))
+        return [(a * w * scales["input"], b * w * scales["input"]) for w, (a, b) in itertools.product(edges, sides)]
 
 
 @final
@@ -59,11 +99,8 @@ class InputDeadZone(Law):
     experiment = SMALL_AND_LARGE
     family = "dead-zone"
     stage = 20
-    rivals: ClassVar = {
-        "coulomb-friction": FREE_DECAY,
-        "input-gain": LEVELS,
-        "backlash": "reverse the input away from zero: play stays there, a dead zone does not",
-    }
+    variants = (UnevenDeadZone,)
+    rivals: ClassVar = {"coulomb-friction": FREE_DECAY, "input-gain": LEVELS, "backlash": REVERSALS}
 
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         return [(w * scales["input"],) for w in spread(0.02, 1.2, 9)]
@@ -101,7 +138,7 @@ class InputRateLimitedLag(Law):
     site = "input"
     parameters = (
         EffectParameter("rate", {"input": 1, "time": -1}, (2.0, 10.0), 0.02, 2e4, off=NEVER),
-        EffectParameter("time_constant", {"time": 1}, (0.01, 0.05), 0.0, THRESHOLDS.slowest_lag),
+        _time_constant(2.0, 5.0),
     )
     equation = "r acts, ṙ = clip((u − r)/time_constant, ±rate)"
     signature = "large steps become ramps with a rounded end, small ones arrive rounded"
@@ -132,12 +169,45 @@ class InputRateLimitedLag(Law):
 
 
 @final
+class SecondOrderLag(Law):
+    """u acts as s, ṡ = (r − s)/T₂, ṙ = (u − r)/T₁: two lags, each by its mean over a sub-step."""
+
+    name = "input-lag-second-order"
+    variant_of = "input-lag"
+    site = "input"
+    parameters = (_time_constant(2.0, 10.0), _time_constant(1.0, 5.0, name="second"))
+    equation = "s acts, second·ṡ = r − s, time_constant·ṙ = u − r"
+    signature = "steps arrive rounded at both ends, and fast inputs come out much smaller and late"
+    experiment = FAST
+    family = "late"
+    stage = 50
+    contains: ClassVar = {"input-lag": {"time_constant": "time_constant"}}
+    rivals: ClassVar = {"input-delay": FAST, "input-rate-limit": SMALL_AND_LARGE, "sensor-delay": FAST}
+
+    def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
+        return [(t, share * t) for t in times(self.parameters[0], scales, 0.2) for share in (0.3, 1.0)]
+
+    def canonical(self, values: Mapping[str, float]) -> dict[str, float]:
+        """The longer one first."""
+        return dict(zip(values, sorted(values.values(), reverse=True), strict=True))
+
+    def extension(self, site: str, model: gc.Model) -> Extension:
+        own, unit = self.named(site, model), site_units(model, self.site, site)["input"]
+        names, target, kept = [f"{p.name}_reached" for p in own], "{u}", []
+        for p, name in zip(own, names, strict=True):
+            mean, end = (t.format(memory=name, time_constant=p.name, h="{h}") for t in _lagging(f"({_kept(target)})"))
+            kept.append(Memory(name, unit, end))
+            target = mean
+        return Extension(self.name, site, own, input=target, memory=tuple(kept))
+
+
+@final
 class InputLag(Law):
     """u acts as r, ṙ = (u − r)/T, as its exact mean over each sub-step."""
 
     name = "input-lag"
     site = "input"
-    parameters = (EffectParameter("time_constant", {"time": 1}, (0.005, 0.03, 0.1), 0.0, THRESHOLDS.slowest_lag),)
+    parameters = (_time_constant(1.0, 3.0, 10.0),)
     equation = "r acts, time_constant·ṙ = u − r"
     memory = Memory("{time_constant}_reached", "{input}", _ARRIVED[1])
     adds: ClassVar = {"input": _ARRIVED[0]}
@@ -145,10 +215,11 @@ class InputLag(Law):
     experiment = FAST
     family = "late"
     stage = 50
+    variants = (SecondOrderLag,)
     rivals: ClassVar = {"input-delay": FAST, "input-rate-limit": SMALL_AND_LARGE, "sensor-delay": FAST, "backlash": FREE_DECAY}
 
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
-        return [(t,) for t in spread(min(0.5 * scales["period"], 0.01), 0.7, 8)]
+        return [(t,) for t in times(self.parameters[0], scales, 0.3)]
 
 
 @final
@@ -218,19 +289,67 @@ class InputOffset(Law):
     rivals: ClassVar = {"constant-force": LEVELS, "input-gain": LEVELS, "coulomb-friction": BOTH_WAYS}
 
 
+def _level(high: float) -> EffectParameter:
+    return EffectParameter("level", {"input_peak": 1}, (0.3, 0.8), 0.002, high, off=NEVER)
+
+
+@final
+class SoftSaturation(Law):
+    """u acts as L·tanh(u/L)."""
+
+    name = "input-saturation-soft"
+    variant_of = "input-saturation"
+    site = "input"
+    parameters = (_level(10.0),)
+    equation = "level·tanh(u/level) acts"
+    adds: ClassVar = {"input": "{level}*tanh({u}/{level})"}
+    signature = "small inputs act as they should, larger ones ever weaker"
+    experiment = SMALL_AND_LARGE
+    family = "limit"
+    stage = 80
+    rivals: ClassVar = {"input-gain": SMALL_AND_LARGE, "input-rate-limit": FAST, "quadratic-drag": FREE_DECAY}
+
+    def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
+        return [(level,) for level in spread(0.2 * scales["input"], 3.0 * scales["input_peak"], 12)]
+
+
+@final
+class RoundedSaturation(Law):
+    """u acts as u/(1 + |u/L|ᵖ)^(1/p), which comes to clip(u, ±L) as p grows."""
+
+    name = "input-saturation-rounded"
+    variant_of = "input-saturation"
+    site = "input"
+    parameters = (_level(10.0), EffectParameter("sharpness", {}, (3.0, 6.0), 0.7, 40.0, off=2.0))
+    equation = "u/(1 + |u/level|^sharpness)^(1/sharpness) acts"
+    adds: ClassVar = {"input": "{u}/(1 + abs({u}/{level})**{sharpness})**(1/{sharpness})"}
+    signature = "small inputs act as they should, larger ones ever weaker, more or less abruptly"
+    experiment = SMALL_AND_LARGE
+    family = "limit"
+    stage = 80
+    contains: ClassVar = {"input-saturation": {"level": "level"}}
+    rivals: ClassVar = {"input-gain": SMALL_AND_LARGE, "input-rate-limit": FAST, "quadratic-drag": FREE_DECAY}
+
+    def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
+        levels = spread(0.2 * scales["input"], 2.0 * scales["input_peak"], 8)
+        return list(itertools.product(levels, (1.2, 2.5, 6.0)))
+
+
 @final
 class InputSaturation(Law):
     """u acts as clip(u, ±L)."""
 
     name = "input-saturation"
     site = "input"
-    parameters = (EffectParameter("level", {"input_peak": 1}, (0.3, 0.8), 0.002, 1.0, off=NEVER),)
+    parameters = (_level(1.0),)
     equation = "clip(u, ±level) acts"
     adds: ClassVar = {"input": "min(max({u}, -{level}), {level})"}
     signature = "small inputs act as they should, large ones all alike"
     experiment = SMALL_AND_LARGE
     family = "limit"
     stage = 80
+    variants = (SoftSaturation, RoundedSaturation)
+    equivalent: ClassVar = {"wheel-slip": "where one input is the force that the ground takes"}
     rivals: ClassVar = {
         "input-gain": SMALL_AND_LARGE,
         "wheel-slip": SMALL_AND_LARGE,

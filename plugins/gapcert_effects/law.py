@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Literal
@@ -9,8 +10,9 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 import gapcert as gc
-from gapcert.plugin import Effect, Extension, Memory, site_units
+from gapcert.plugin import Effect, EffectParameter, Extension, Memory, site_units
 from gapcert_effects.plugin import SENTENCES
+from gapcert_effects.thresholds import THRESHOLDS
 
 _LENGTHS = ("m", "mm", "cm", "km")
 _TURNS = ("rad", "deg", "rev", "turn", "rpm")
@@ -34,7 +36,7 @@ class Law(Effect):
 
     def __init_subclass__(cls) -> None:
         if "sentence" not in vars(cls):
-            cls.sentence = SENTENCES.get(getattr(cls, "name", ""), "")
+            cls.sentence = SENTENCES.get(cls.variant_of or getattr(cls, "name", ""), "")
 
     def applies(self, site: str, model: gc.Model) -> bool:
         return all(holds(site, model) for holds in self.where)
@@ -54,6 +56,13 @@ class Law(Effect):
 def spread(low: float, high: float, count: int) -> tuple[float, ...]:
     """`count` numbers from low to high, each the same multiple of the one before."""
     return tuple(float(v) for v in np.geomspace(low, high, count))
+
+
+def times(parameter: EffectParameter, scales: Mapping[str, float], share: float = 0.9) -> tuple[float, ...]:
+    """From half a period of sampling to this share of the longest time that a parameter may take."""
+    high = share * parameter.bounds(scales)[1]
+    low = min(0.5 * scales["period"], 0.5 * high)
+    return spread(low, high, 1 + math.ceil(math.log(high / low) / math.log(THRESHOLDS.next_time)))
 
 
 def driven(site: str, model: gc.Model) -> bool:

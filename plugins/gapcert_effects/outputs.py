@@ -12,7 +12,7 @@ from gapcert.plugin import EffectParameter
 from gapcert_effects.thresholds import THRESHOLDS
 
 from .experiments import CREEP, FAST, FREE_DECAY, PLACES, SECOND
-from .law import Law, spread
+from .law import Law, times
 
 _FINEST = 1e-15  # of an output's unit: a resolution that rounds nothing
 
@@ -57,7 +57,11 @@ class SensorDelay(Law):
 
     name = "sensor-delay"
     site = "output"
-    parameters = (EffectParameter("delay", {"time": 1}, (0.003, 0.02, 0.05), 0.0, THRESHOLDS.latest_output),)
+    parameters = (
+        EffectParameter(
+            "delay", {"period": 1}, (0.6, 2.0, 5.0), 0.0, THRESHOLDS.shown_periods, longest=THRESHOLDS.latest_output
+        ),
+    )
     equation = "y(t − delay) is seen"
     adds: ClassVar = {"output_delay": "{delay}"}
     signature = "this output comes late in all that it shows, whatever moves it"
@@ -67,7 +71,7 @@ class SensorDelay(Law):
     rivals: ClassVar = {"input-delay": SECOND, "input-lag": FAST}
 
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
-        return [(t,) for t in spread(min(0.5 * scales["period"], 0.01), 0.9 * THRESHOLDS.latest_output, 8)]
+        return [(t,) for t in times(self.parameters[0], scales)]
 
 
 @final

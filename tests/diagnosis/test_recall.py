@@ -9,6 +9,7 @@ import gapcert as gc
 from gapcert.testing import multisine
 from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.fitting.hypothesis import Hypothesis, recalled
+from gapcert_diagnosis.search.candidates import Candidate, Library
 from gapcert_diagnosis.testing import CART, equations
 
 PERIOD = 0.01
@@ -58,6 +59,20 @@ def test_a_clock_needs_no_past_and_rows_keep_their_order():
     lag, _, windows, _ = slow("input-lag", "u", value=0.7)
     rows = recalled(lag, windows, {"input_lag_u": np.array([0.1, 0.7])}, 2).reshape(2, len(windows), -1)
     np.testing.assert_array_equal(rows[1], recalled(lag, windows, {"input_lag_u": 0.7}, 1))
+
+
+def test_a_late_input_is_known_however_late_it_comes():
+    model = equations(CART)
+    u = multisine(8.0, PERIOD, 2.0, (0.1, 2.0), 3)
+    measured = Dataset.of(model, gc.Recording.of(np.arange(len(u)) * PERIOD, {"q": np.sin(u[:, 0]), "u": u[:, 0]}))
+    late = Candidate(gc.registry().build("effect", "input-delay"), "u")
+    extended = Library(model, measured, [late.effect]).extended((late,), {})
+    windows = measured.windows(100)
+    found = recalled(extended, windows, {}, 1)
+    first = windows.place[:, 1] - measured.history
+    assert found.shape[1] == 80  # a tenth of eight seconds
+    for k in (1, 7, 80):
+        np.testing.assert_array_equal(found[:, k - 1], u[np.maximum(first - k, 0), 0])
 
 
 @pytest.mark.parametrize(

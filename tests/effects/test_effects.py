@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar, final
 
+import numpy as np
 import pytest
 
 import gapcert as gc
@@ -15,21 +16,36 @@ from gapcert_effects.plugin import HOMES
 
 NAMES = [name for effects in HOMES.values() for name in effects if not name.startswith("contact-")]
 CHECKS = [c for c in dir(EffectContract) if c.startswith("test_")]
+VARIANTS = [form for name in NAMES for form in gc.registry().build("effect", name).variants]
 ENGINES = {"contact-friction", "contact-restitution", "engine-setting"}
 
 
 def test_the_page_says_how_late_is_too_late():
-    delay, lag = (gc.registry().build("effect", n).parameters[0].high for n in ("input-delay", "input-lag"))
     page = " ".join((Path(__file__).parents[2] / "docs" / "effects.md").read_text().split())
-    assert f"Delays are looked for up to {delay:g} s, lags up to {lag:g} s" in page
+    shares = {"a tenth": 0.1, "a twentieth": 0.05, "lags up to all": 1.0}
+    late = [gc.registry().build("effect", n).parameters[0] for n in ("input-delay", "sensor-delay", "input-lag")]
+    for (said, share), p in zip(shares.items(), late, strict=True):
+        assert said in page
+        assert p.longest == share
+        assert p.high == float("inf") or f"(and {p.high:g} samples)" in page
+
+
+@pytest.mark.parametrize("period", [0.001, 0.1, 20.0])
+@pytest.mark.parametrize("name", ["input-delay", "input-lag", "sensor-delay"])
+def test_times_are_looked_for_on_the_scale_of_the_log(name, period):
+    effect, scales = gc.registry().build("effect", name), {"period": period, "duration": 800 * period}
+    (low, high), tried = effect.parameters[0].bounds(scales), np.array(effect.grid(scales))[:, 0]
+    assert low == 0 < tried[0] < period < 40 * period <= high <= 800 * period
+    assert tried[-1] < high
+    assert (tried[1:] / tried[:-1] < 2).all()
 
 
 @pytest.mark.contract
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, *(form.name for form in VARIANTS)])
 def test_keeps_the_contract(name):
     class Contract(EffectContract):
         def effect(self):
-            return gc.registry().build("effect", name)
+            return next((form() for form in VARIANTS if form.name == name), None) or gc.registry().build("effect", name)
 
     contract = Contract()
     for check in CHECKS:
@@ -45,6 +61,16 @@ def test_is_declared_under_its_name(name):
     for others in (effect.rivals, effect.contains, effect.equivalent):
         assert set(others) <= set(NAMES) - {name}
         assert all(others.values())
+
+
+def test_other_forms_of_a_cause_are_named_as_it_is():
+    for name in NAMES:
+        effect = gc.registry().build("effect", name)
+        for form in effect.variants:
+            assert form.name.startswith(f"{name}-")
+            assert (form.variant_of, form.site, form.stage, form.family) == (name, effect.site, effect.stage, effect.family)
+            assert form.sentence == effect.sentence
+            assert set(form.rivals) <= set(NAMES)
 
 
 def test_every_name_of_the_contract_is_there():

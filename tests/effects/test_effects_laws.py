@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -123,6 +124,46 @@ def test_dead_zone_saturation_gain_and_offset():
     np.testing.assert_allclose(gives("input-saturation", level=0.3), np.clip(LEVELS, -0.3, 0.3), atol=1e-12)
     np.testing.assert_allclose(gives("input-gain", gain=-1.2), -1.2 * LEVELS, atol=1e-12)
     np.testing.assert_allclose(gives("input-offset", offset=0.2), LEVELS + 0.2, atol=1e-12)
+
+
+def form(name, of="u", section=FREE, **numbers):
+    """What reaches the model of LEVELS under another form of an effect."""
+    effect = next(f for n in INPUTS for f in gc.registry().build("effect", n).variants if f.name == name)()
+    model = equations(section)
+    extension = effect.extension(of, model)
+    parameters = tuple(replace(p, value=numbers[e.name]) for p, e in zip(extension.parameters, effect.parameters, strict=True))
+    extended = model.extend([replace(extension, parameters=parameters)])
+    return np.diff(extended.fast_rollout(np.zeros((1, 1)), LEVELS[None, :, None]).x[0, :, 0]) / 0.01
+
+
+INPUTS = ("input-dead-zone", "input-saturation", "input-lag")
+
+
+def test_soft_limits_bend_before_they_hold():
+    np.testing.assert_allclose(form("input-saturation-soft", level=0.4), 0.4 * np.tanh(LEVELS / 0.4), atol=1e-12)
+    rounded = LEVELS / np.sqrt(1 + (LEVELS / 0.4) ** 2)
+    np.testing.assert_allclose(form("input-saturation-rounded", level=0.4, sharpness=2.0), rounded, atol=1e-12)
+    hard = form("input-saturation-rounded", level=0.4, sharpness=500.0)
+    np.testing.assert_allclose(hard, np.clip(LEVELS, -0.4, 0.4), atol=1e-3)
+
+
+def test_a_dead_zone_may_lie_on_one_side_of_zero():
+    for minus, plus in ((0.1, 0.5), (-0.1, 0.5), (0.6, 0.0)):
+        found = form("input-dead-zone-uneven", minus=minus, plus=plus)
+        np.testing.assert_allclose(found, LEVELS - np.clip(LEVELS, -minus, plus), atol=1e-12)
+
+
+def test_a_second_lag_follows_the_first():
+    found, one, two, z, fine = form("input-lag-second-order", time_constant=0.3, second=0.08), 0.3, 0.08, np.zeros(2), 400
+    for k, level in enumerate(LEVELS[:80]):
+        passed = []
+        for _ in range(fine):
+            z[0] += (level - z[0]) * 0.01 / fine / one
+            z[1] += (z[0] - z[1]) * 0.01 / fine / two
+            passed.append(z[1])
+        assert found[k] == pytest.approx(np.mean(passed), abs=1e-3)
+    alone = np.diff(driven(FREE, "input-lag", "u", LEVELS, time_constant=0.3)[:, 0]) / 0.01
+    np.testing.assert_allclose(form("input-lag-second-order", time_constant=0.3, second=0.0), alone, atol=1e-12)
 
 
 def test_play_keeps_its_distance_and_holds_in_between():
@@ -247,6 +288,14 @@ TWINS = [
     (BLOCK, ("constant-force", "q", {"force": 2 * 9.80665 * math.sin(0.1)}), ("gravity-tilt", "q", {"angle": 0.1}), None),
     (ROD, ("gravity-tilt", "q", {"angle": 0.1}), ("sensor-bias", "q", {"bias": 0.1}), -0.1),
 ]
+
+
+def test_a_soft_limit_of_one_force_is_slip():
+    model, slip = equations(CART), with_effect(CART, "wheel-slip", "q", traction=0.7)
+    soft = gc.registry().build("effect", "input-saturation").variants[0]().extension("u", model)
+    limited = model.extend([replace(soft, parameters=(replace(soft.parameters[0], value=0.7),))])
+    x, u = np.array([[0.1, 0.2]]), 2 * np.sin(0.07 * np.arange(200))[None, :, None]
+    np.testing.assert_allclose(slip.rollout(x, u).x, limited.rollout(x, u).x, atol=1e-12)
 
 
 @pytest.mark.parametrize(("section", "one", "two", "shift"), TWINS, ids=[f"{a[0]}-{b[0]}" for _, a, b, _ in TWINS])

@@ -165,7 +165,18 @@ def recalled(model: Model, windows: Windows, parameters: Mapping[str, Array | fl
             _WAYS[windows] = _Way(windows.measured, rows, {p: first[r] for p, r in rows.items()})
         for piece, hidden in _Past(model, _WAYS[windows], parameters, count).found().items():
             out[:, _WAYS[windows].rows[piece]] = hidden
+    _commanded(model, windows, out)
     return out.reshape(count * len(windows), -1)
+
+
+def _commanded(model: Model, windows: Windows, out: Array) -> None:
+    """Late inputs among hidden states (count, W, nh), as they were commanded; before a recording its first input acted."""
+    m, inputs, names = windows.measured, [s.name for s in model.inputs], [s.name for s in model.hidden]
+    for i, name in enumerate(inputs):
+        late = [j for j, n in enumerate(names) if n.rpartition("_")[0] == f"{name}_delay"]
+        back = np.array([int(names[j].rpartition("_")[2]) for j in late], dtype=int)
+        for w, (piece, first) in enumerate(windows.place.tolist() if late else ()):
+            out[:, w, late] = m.driven[piece][np.maximum((first - m.history) * m.repeat - back, 0), i]
 
 
 def _defaults(model: Model, count: int, t: Array) -> Array:

@@ -73,7 +73,7 @@ def answered(search: FittedSets, found: Found, windows: Windows) -> Answer:
     ties = [t for t in _ties(whole, (causes, last), rivals) if not _refuted(search, t[0], found, later)]
     simplest = _simplest(whole, [(causes, last), *ties])
     answer = Answer(whole, causes, last, tuple(ties), rivals, search.negligible)
-    return answer if simplest[0] == causes else answer.with_answer(simplest)
+    return _told(answer if simplest[0] == causes else answer.with_answer(simplest))
 
 
 def decided(answer: Answer, judge: Stretches) -> Answer:
@@ -93,6 +93,20 @@ def decided(answer: Answer, judge: Stretches) -> Answer:
         return answer
     answer = answer.with_answer(min(better, key=lambda f: judge.error(f[1])))
     return replace(answer, ties=tuple(f for f in answer.ties if not foretells(answer.fit, f[1])))
+
+
+def _told(answer: Answer) -> Answer:
+    """Without what differs from the causes, or from one before it, in the form of a law only."""
+
+    def differ(found: Sequence[Found]) -> tuple[Found, ...]:
+        seen, kept = {frozenset(c.told for c in answer.causes)}, list[Found]()
+        for f in found:
+            if (names := frozenset(c.told for c in f[0])) not in seen:
+                seen.add(names)
+                kept.append(f)
+        return tuple(kept)
+
+    return replace(answer, ties=differ(answer.ties), rivals={k: differ(found) for k, found in answer.rivals.items()})
 
 
 def _refuted(search: FittedSets, causes: Causes, found: Found, later: Windows) -> bool:
@@ -211,8 +225,8 @@ def smallest(search: FittedSets) -> tuple[Seen, ...]:
     """What each effect would have had to be, to be named in these data."""
     library, out = search.library, []
     (table,) = search.screen.tables([(search.nothing, 1)])
-    for c in library.candidates:
+    for c in (c for c in library.candidates if not c.effect.variant_of):
         (low, high), row = library.bounds(c), table.least(c, library.charge())
         if row is not None and (row >= low).all() and (row <= high).all():
-            out.append(Seen(*c.key, c.effect.parameters[0].name, float(row[0]), library.units(c)[0]))
+            out.append(Seen(*c.told, c.effect.parameters[0].name, float(row[0]), library.units(c)[0]))
     return tuple(out)

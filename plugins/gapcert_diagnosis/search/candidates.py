@@ -34,6 +34,11 @@ class Candidate:
     def key(self) -> tuple[str, str]:
         return self.effect.name, self.site
 
+    @property
+    def told(self) -> tuple[str, str]:
+        """The name that is reported, and the site."""
+        return self.effect.variant_of or self.effect.name, self.site
+
 
 Causes = tuple[Candidate, ...]
 
@@ -55,6 +60,7 @@ class Library:
         self._models: dict[tuple[Sequence[tuple[str, str]], Sequence[tuple[str, float]]], Model] = {}
         self._restatements: dict[Sequence[tuple[str, float]], Model] = {}
         self._path = np.concatenate(measured.states), np.concatenate(measured.inputs)
+        effects = [v for e in effects for v in (e, *(form() for form in e.variants))]
         every = [c for e in effects for s in model.sites(e.site) if self._possible(c := Candidate(e, s))]
         self.aside = tuple(c for c in every if self._places(c) and not self.scales(c)["position_range"])
         every = [c for c in every if c not in self.aside]
@@ -109,7 +115,16 @@ class Library:
         return 12 + 2 * math.log(max(1, len(self.candidates) + settings))
 
     def extension(self, c: Candidate) -> Extension:
-        return once(self._extensions, c.key, lambda: c.effect.extension(c.site, self.model))
+        return once(self._extensions, c.key, lambda: self._extension(c))
+
+    def _extension(self, c: Candidate) -> Extension:
+        """What remembers as long as its bounds allow has those of the data."""
+        e = c.effect.extension(c.site, self.model)
+        if e.delay is None:
+            return e
+        own = (p.bounds(self.scales(c)) for p in c.effect.parameters)
+        numbers = (replace(p, low=low, high=high) for p, (low, high) in zip(e.parameters, own, strict=True))
+        return replace(e, parameters=tuple(numbers))
 
     def freed(self, c: Candidate) -> Parameter | None:
         """The parameter of the model that a candidate frees, as it is stated; None of a law, which has numbers of its own."""
@@ -138,13 +153,13 @@ class Library:
         return other in direct or any(self.contains(d, other) for d in direct)
 
     def related(self, a: Candidate, b: Candidate) -> bool:
-        """At one site, is one law a special case of the other?"""
+        """At one site, is one law a special case of the other, or another form of it?"""
         one, two = a.effect.name, b.effect.name
-        return a.site == b.site and (one == two or self.contains(one, two) or self.contains(two, one))
+        return a.told == b.told or (a.site == b.site and (self.contains(one, two) or self.contains(two, one)))
 
     def simplicity(self, causes: Causes) -> tuple[int, list[int]]:
         """Fewest numbers first, then the order of the contract."""
-        order = [ORDER.index(c.effect.name) if c.effect.name in ORDER else len(ORDER) for c in causes]
+        order = [ORDER.index(c.told[0]) if c.told[0] in ORDER else len(ORDER) for c in causes]
         return sum(len(c.effect.parameters) for c in causes), sorted(order)
 
     def scales(self, c: Candidate) -> dict[str, float]:
@@ -199,7 +214,7 @@ class Library:
             ends = stated.value - THRESHOLDS.doubt_reach * doubt, stated.value + THRESHOLDS.doubt_reach * doubt
             return np.array([max(ends[0], stated.low)]), np.array([min(ends[1], stated.high)])
         scale = np.array([p.scale(self.scales(c)) for p in c.effect.parameters])
-        low, high = (np.array([getattr(p, n) for p in c.effect.parameters]) * scale for n in ("low", "high"))
+        low, high = np.array([p.bounds(self.scales(c)) for p in c.effect.parameters]).T
         if stated is not None:
             low, high = np.sort([stated.value * low / scale, stated.value * high / scale], axis=0)
             if stated.low < 0:  # A place, or a component, may have either sign.

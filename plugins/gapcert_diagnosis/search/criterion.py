@@ -228,4 +228,4 @@ def without(causes: Causes, others: Causes) -> Causes:
 
 def named(causes: Causes) -> str:
     """`coulomb-friction at q + viscous-friction at q`."""
-    return " + ".join(f"{effect} at {site}" for effect, site in (c.key for c in causes)) or "no cause"
+    return " + ".join(f"{effect} at {site}" for effect, site in (c.told for c in causes)) or "no cause"

@@ -1,0 +1,110 @@
+"""What happens to an input on its way, as it is told: on ovens, valves and carts, simulated by hand in fine steps."""
+
+import numpy as np
+import pytest
+
+import gapcert as gc
+from gapcert_diagnosis import diagnose
+from gapcert_diagnosis.testing import equations
+
+FINE = 20
+AIR = {"Ta": "290 K"}
+OVEN = (
+    {"states": {"T": "K"}, "inputs": {"P": "W"}, "period": "4 s"}
+    | {
+        "parameters": {
+            "C": {"value": "11.2 J/K", "tolerance": "4 %"},
+            "G": {"value": "0.052 W/K", "tolerance": "4 %"},
+            "Ta": "290 K",
+        }
+    }
+    | {"derivative": {"T": "(P - G*(T - Ta))/C"}},
+    lambda x, u: np.array([(u - 0.0525 * (x[0] - 290)) / 11.1]),
+    290.0,
+)
+VALVE = (
+    {"states": {"y": "V"}, "inputs": {"u": "V"}, "period": "50 ms", "derivative": {"y": "k*u"}}
+    | {"parameters": {"k": {"value": "1.72 1/s", "tolerance": "5 %"}}},
+    lambda x, u: np.array([1.7 * u]),
+    0.0,
+)
+CART = (
+    {"coordinates": {"x": "m"}, "inputs": {"f": "N"}, "period": "10 ms", "mass_matrix": [["m"]]}
+    | {"parameters": {"m": {"value": "1.31 kg", "tolerance": "1 %"}, "b": {"value": "2.6 N*s/m", "tolerance": "2 %"}}}
+    | {"bias": {"x": "b*x_dot"}, "forces": {"x": "f"}},
+    lambda x, u: np.array([x[1], (u - 2.62 * x[1]) / 1.3]),
+    0.0,
+)
+
+
+def commands(count, hold, seed, low=-1.0):
+    """Levels that are held, and a wave on them."""
+    rng = np.random.default_rng(seed)
+    steps = np.repeat(rng.uniform(low, 1, count // hold + 1), hold)[:count]
+    return 0.8 * steps + 0.2 * np.sin(np.arange(count) * 2.1 / hold + seed) * (low < 0)
+
+
+def delayed(u, seconds, h):
+    return np.concatenate([np.full(round(seconds / h), u[0]), u])[: len(u)]
+
+
+def lagged(u, seconds, h):
+    out, z = np.empty_like(u), 0.0
+    for k, level in enumerate(u):
+        new = level + (z - level) * np.exp(-h / seconds)
+        out[k], z = (z + new) / 2, new
+    return out
+
+
+def told(plant, u, way, seed=0, noise=0.004):
+    """The diagnosis of a plant which the input u (T,) reaches by way(fine input, fine step)."""
+    section, slope, rest = plant
+    model = equations({"kind": "equations", "integrator": "rk4", **section})
+    h = model.period / FINE
+    x, path = np.full(1, rest) if model.nx == 1 else np.zeros(model.nx), []
+    acting = way(np.repeat(u, FINE), h).reshape(len(u), FINE)
+    for levels in acting:
+        path.append(x[0])
+        for level in levels:
+            x = x + h * slope(x + h / 2 * slope(x, level), level)
+    y = np.array(path)
+    y = y + noise * np.std(y) * np.random.default_rng(seed).standard_normal(len(y))
+    names = model.outputs[0].name, model.inputs[0].name
+    recording = gc.Recording.of(np.arange(len(u)) * model.period, dict(zip(names, (y, u), strict=True)), hold="zero")
+    return diagnose(model, recording)
+
+
+def only(found, name):
+    """The numbers of the one cause that is named."""
+    assert [c.effect for c in found.causes] == [name]
+    assert not any(g == ((name, found.causes[0].site),) for g in found.ambiguous_with)
+    return {n: p.value for n, p in found.causes[0].parameters.items()}
+
+
+@pytest.mark.parametrize(("name", "number"), [("input-lag", "time_constant"), ("input-delay", "delay")])
+def test_an_oven_may_be_late_by_minutes(name, number):
+    late = delayed if name == "input-delay" else lagged
+    found = told(OVEN, 9 * commands(600, 50, 1, low=0.0), lambda u, h: late(u, 80.0, h))
+    assert only(found, name) == {number: pytest.approx(80, rel=0.05)}
+
+
+def test_two_lags_are_one_of_second_order():
+    found = only(told(VALVE, commands(1500, 25, 2), lambda u, h: lagged(lagged(u, 0.3, h), 0.17, h)), "input-lag")
+    assert found == {"time_constant": pytest.approx(0.3, rel=0.1), "second": pytest.approx(0.17, rel=0.15)}
+
+
+def test_a_valve_opens_on_one_side_first():
+    found = only(told(VALVE, commands(1500, 25, 3), lambda u, h: u - np.clip(u, -0.05, 0.3)), "input-dead-zone")
+    assert found == {"minus": pytest.approx(0.05, abs=0.01), "plus": pytest.approx(0.3, abs=0.01)}
+
+
+@pytest.mark.parametrize("hard", [True, False])
+def test_a_limit_is_one_cause_hard_or_soft(hard):
+    found = told(CART, 5 * commands(1500, 60, 4), lambda u, h: np.clip(u, -2, 2) if hard else 2.4 * np.tanh(u / 2.4))
+    assert only(found, "input-saturation") == {"level": pytest.approx(2.0 if hard else 2.4, rel=0.03)}
+    assert found.ambiguous_with == (() if hard else ((("wheel-slip", "x"),),))
+
+
+def test_nothing_is_found_where_the_input_arrives_as_it_was_sent():
+    for plant, low in ((OVEN, 0.0), (VALVE, -1.0), (CART, -1.0)):
+        assert told(plant, 5 * commands(1200, 40, 5, low), lambda u, h: u).verdict == "nothing"
