@@ -24,10 +24,11 @@ class EffectParameter:
     """One number of an effect, in powers of what a site is measured in.
 
     `dimension` maps force, velocity, position, input, output (the root mean square at the site), the same with `_peak`,
-    position_range, time, angle, mass and value (of a parameter) to exponents (empty: a pure number). It gives the unit at a
-    site and, from the data there, the scale; `starts`, `low` and `high` are multiples of that scale (of 1 s, 1 rad and 1 for
-    times, angles and pure numbers). At `off`, in its unit, the effect does nothing; it may lie beyond the bounds. plausible:
-    values in the same multiples outside which a fit is flagged. step: of differences, likewise; 0: from the starts.
+    position_range, time, period (of sampling), angle, mass and value (of a parameter) to exponents (empty: a pure number). It
+    gives the unit at a site and, from the data there, the scale; `starts`, `low` and `high` are multiples of that scale (of
+    1 s, 1 rad and 1 for times, angles and pure numbers). At `off`, in its unit, the effect does nothing; it may lie beyond the
+    bounds. plausible: values in the same multiples outside which a fit is flagged. step: of differences, likewise; 0: from the
+    starts. longest: of a time, as a share of the duration of the data.
     """
 
     name: str
@@ -38,15 +39,21 @@ class EffectParameter:
     off: float = 0.0
     plausible: tuple[float, float] = (float("-inf"), float("inf"))
     step: float = 0.0
+    longest: float = float("inf")
 
     def unit(self, site: Mapping[str, str]) -> str:
         """From the units of force, velocity, position and input at a site."""
-        known = {**site, "time": "s", "angle": "rad", "mass": "kg"}
+        known = {**site, "time": "s", "period": "s", "angle": "rad", "mass": "kg"}
         return product((known[k.partition("_")[0]], n) for k, n in self.dimension.items())
 
     def scale(self, site: Mapping[str, float]) -> float:
         """From the root mean squares of force, velocity, position and input at a site."""
         return float(np.prod([{**site, "time": 1.0, "angle": 1.0}[k] ** n for k, n in self.dimension.items()]))
+
+    def bounds(self, site: Mapping[str, float]) -> tuple[float, float]:
+        """(low, high) in its unit, from the same."""
+        scale = self.scale(site)
+        return self.low * scale, min(self.high * scale, self.longest * site.get("duration", float("inf")))
 
 
 class Effect(ABC):
@@ -86,6 +93,10 @@ class Effect(ABC):
         `position_range`, and in s the `period` of sampling and the `start` and `duration` of the data.
         """
         return list(itertools.product(*([s * p.scale(scales) for s in p.starts] for p in self.parameters)))
+
+    def suggested(self, place: Array, force: Array) -> list[tuple[float, ...]]:
+        """More first values, in their units, that a force (n,) left over at places (n,) of a coordinate suggests."""
+        return []
 
     def canonical(self, values: Mapping[str, float]) -> dict[str, float]:
         """The same effect in the numbers that a report shows, where several sets of numbers mean the same."""
