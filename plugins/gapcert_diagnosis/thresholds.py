@@ -186,6 +186,7 @@ class Thresholds:
     swept_points: int = chosen(1000, "of a range, in which a law's size is looked for")
     nuisance_reach: float = decides(3.0, "tolerances that a stated parameter may be off before that is itself a cause")
     tolerance_sigmas: float = threshold(2.0, "as usual: a tolerance is a 95 % interval")
+    needle_step: float = chosen(1 / 6, "of the least distance between values that are suggested, as a difference step at most")
     difference_step: float = decides(0.1, "of the smallest start: steps must see over the kinks of dry laws")
     nuisance_step: float = decides(0.1, "of a tolerance, for differences")
     doubt_starts: tuple[float, float] = chosen((-0.1, 0.1), "of the scale of a doubt, on either side of what is stated")

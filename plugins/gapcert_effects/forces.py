@@ -6,8 +6,10 @@ import math
 from collections.abc import Mapping
 from typing import ClassVar, final
 
+import numpy as np
+
 import gapcert as gc
-from gapcert.plugin import EffectParameter, Extension, Memory
+from gapcert.plugin import Array, EffectParameter, Extension, Memory
 from gapcert_effects.thresholds import THRESHOLDS
 
 from .experiments import BOTH_WAYS, FREE_DECAY, LEVELS, PLACES, REVERSALS, SHAKE_AND_HOLD, SMALL_AND_LARGE, VARY_SPEED
@@ -138,7 +140,9 @@ class Cogging(Law):
     parameters = (
         EffectParameter("amplitude", {"force": 1}, (0.1,), -3.0, 3.0),
         # A period that is wrong by p²/range is out of step at one end: slopes need steps far below that.
-        EffectParameter("period", {"position_range": 1}, (0.2,), 0.02, 1 / THRESHOLDS.min_turns, off=1.0, step=2e-4),
+        EffectParameter(
+            "period", {"position_range": 1}, (0.2,), 1 / THRESHOLDS.finest_turns, 1 / THRESHOLDS.min_turns, off=1.0, step=2e-4
+        ),
         EffectParameter("phase", {"angle": 1}, (0.1,), -10.0, 10.0),
     )
     equation = "f = amplitude·sin(2π·q/period + phase)"
@@ -154,13 +158,44 @@ class Cogging(Law):
         """Periods half a turn apart at the ends of the range, so that one of them lies on the slope of every needle."""
         force, reach = 0.1 * scales["force"], scales["position_range"]
         turns = [THRESHOLDS.min_turns * 1.05 + 0.5 * k for k in range(round(2 * (THRESHOLDS.max_turns - THRESHOLDS.min_turns)))]
-        return [(force, reach / n, phase) for n in turns for phase in (0.0, 0.5 * math.pi)]
+        return [(force, reach / n, phase) for n in turns for phase in _PHASES]
+
+    def suggested(self, place: Array, force: Array) -> list[tuple[float, ...]]:
+        """The periods beyond these at which parts of the data agree, as far as their samples lie close enough.
+
+        With F the sum of force·exp(2πi·place/period) over each of some parts, |Σ F|² is Σ |F|² where their phases are chance,
+        and as many times that as there are parts where they are one.
+        """
+        if len(place) < THRESHOLDS.agreeing_parts or not np.isfinite(force).all():
+            return []
+        turns, power, chance = _periodogram(place, force)
+        stride = 2 * float(np.quantile(np.abs(np.diff(place)), 0.9))
+        tried = (turns > THRESHOLDS.max_turns) & (turns * stride < np.ptp(place)) & (turns < THRESHOLDS.finest_turns)
+        agreed = np.where(tried, power / np.maximum(chance, 1e-300), 0.0)
+        found: list[float] = []
+        while len(found) < THRESHOLDS.outstanding and agreed.max() > THRESHOLDS.agreeing:
+            found.append(float(turns[np.argmax(agreed)]))
+            agreed[np.abs(turns - found[-1]) < 2.0] = 0.0
+        size, reach = float(np.sqrt(2.0) * np.std(force)), float(np.ptp(place))
+        return [(size, reach / (n + d), phase) for n in found for d in (-0.25, 0.0, 0.25) for phase in _PHASES]
 
     def canonical(self, values: Mapping[str, float]) -> dict[str, float]:
         """A positive amplitude, and a phase within half a turn."""
         phase = values["phase"] + (math.pi if values["amplitude"] < 0 else 0.0)
         turned = math.remainder(phase, 2 * math.pi)
         return {**values, "amplitude": abs(values["amplitude"]), "phase": turned}
+
+
+_PHASES = (0.0, 0.5 * math.pi)
+
+
+def _periodogram(place: Array, force: Array) -> tuple[Array, Array, Array]:
+    """Periods over the range, an eighth apart; |Σ F|² and Σ |F|² over parts of the data, in the order of time."""
+    parts, bins, n = THRESHOLDS.agreeing_parts, 4 * THRESHOLDS.finest_turns, len(place)
+    at = np.minimum(((place - place.min()) / np.ptp(place) * bins).astype(np.intp), bins - 1)
+    sums = np.bincount(np.arange(n) * parts // n * bins + at, force - force.mean(), minlength=parts * bins)
+    each = np.fft.rfft(sums.reshape(parts, bins), 8 * bins, axis=1)
+    return np.arange(each.shape[1]) / 8, np.abs(each.sum(axis=0)) ** 2, np.sum(np.abs(each) ** 2, axis=0)
 
 
 _KEPT = "min(max({memory} - {f}, -{width}), {width})"
@@ -219,7 +254,7 @@ class ExternalPush(Law):
     parameters = (
         EffectParameter("force", {"force": 1}, (-0.5, 0.5), -30.0, 30.0),
         EffectParameter("time", {"time": 1}, (1.0,), float("-inf"), float("inf"), step=0.02),
-        EffectParameter("duration", {"time": 1}, (0.1, 0.4), 1e-3, 10.0, off=1.0, step=0.05),
+        EffectParameter("duration", {"time": 1}, (0.1, 0.4), 1e-3, float("inf"), off=1.0, step=0.05, longest=1.0),
     )
     equation = "f = force while time ≤ t < time + duration"
     adds: ClassVar = {"force": "{force}*max(0, min({t} + {h}, {time} + {duration}) - max({t}, {time}))/{h}"}

@@ -230,7 +230,7 @@ class SupplySag(Law):
     site = "input"
     parameters = (
         EffectParameter("sag", {"input": -1}, (0.1, 0.3), -0.5, 1.0, plausible=(0.0, float("inf"))),
-        EffectParameter("time_constant", {"time": 1}, (0.1, 0.5, 2.0), 0.01, 10.0, off=1.0),
+        EffectParameter("time_constant", {"time": 1}, (0.1, 0.5, 2.0), 0.01, float("inf"), off=1.0, longest=1.0),
     )
     equation = "u·(1 − sag·p) acts, time_constant·ṗ = |u| − p"
     memory = Memory("{sag}_drained", "{input}", _DRAINED[1])
@@ -241,6 +241,13 @@ class SupplySag(Law):
     family = "sag"
     stage = 60
     rivals: ClassVar = {"input-gain": LEVELS, "input-saturation": SMALL_AND_LARGE, "input-lag": FAST}
+
+    def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
+        """Also time constants of a log's own length: of those that are longer, it shows no more than a decline."""
+        sag, time_constant = self.parameters
+        times = {*time_constant.starts, *(s * scales["duration"] for s in (0.2, 0.7))}
+        low, high = time_constant.bounds(scales)
+        return [(s * sag.scale(scales), t) for s in sag.starts for t in sorted(times) if low < t < high]
 
 
 @final

@@ -12,7 +12,11 @@ class Thresholds:
     """Read as `THRESHOLDS.name`."""
 
     min_turns: float = threshold(1.3, "periods over the range: measured on the Silverbox, fewer name a cubic spring")
-    max_turns: float = chosen(20.0, "periods over the range of motion that are tried")
+    max_turns: float = chosen(20.0, "periods over the range of motion that are all tried; of more, those that data suggest")
+    finest_turns: int = chosen(1000, "periods over the range of motion, at most")
+    agreeing_parts: int = chosen(64, "of the data, whose forces must agree on a period")
+    agreeing: float = threshold(10.0, "times what chance makes of them: by the formula, at one period in 22,000")
+    outstanding: int = chosen(2, "periods that data suggest, at most: one may be a harmonic of the other")
     push_starts: int = chosen(80, "tried: the width of a push grows with the length of the recording")
     latest_input: float = chosen(0.1, "of the duration of the data, that an input comes late at most")
     latest_periods: float = chosen(1000.0, "of delay, at most: each is a hidden state")

@@ -11,6 +11,7 @@ import gapcert as gc
 from gapcert.testing import multisine
 from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.experiment import Limits, told_apart
+from gapcert_diagnosis.fitting.fit import fit
 from gapcert_diagnosis.search import gains
 from gapcert_diagnosis.search import screening as screen
 from gapcert_diagnosis.search.alternatives import answered, flags, smallest
@@ -211,6 +212,36 @@ def test_later_data_judge_the_whole_set_and_then_each_member():
     search = FittedSets(library, earlier)
     both = search.fit(best[0], None, best[1].values)
     assert [c.effect.name for c in drop_unconfirmed(search, (best[0], both), later)[0]] == ["cubic-spring"]
+
+
+@pytest.mark.exam
+def test_teeth_far_finer_than_the_range_are_found_and_their_side_lobes_are_not():
+    """A motor with 5 teeth per turn, over some 45 of them, at up to a third of one per sample."""
+    spindle = {
+        **ROD,
+        "parameters": {"J": {"value": "2e-3 kg*m^2", "tolerance": "4 %"}, "b": "0.02 N*m*s/rad"},
+        "mass_matrix": [["J"]],
+        "bias": {"q": "b*q_dot"},
+    }
+    u = 0.9 * multisine(T * PERIOD, PERIOD, 1.0, (0.1, 0.7), 8)
+    hidden = [("cogging", "q", (0.15, 2 * np.pi / 5, 0.4))]
+    model, log = simulated(spindle, hidden, noise=1e-3, seed=5, u=u)
+    assert 40 < np.ptp(log.trajectories[0].channels["q"]) * 5 / (2 * np.pi) < 60
+    answer = named(model, log, [find(n) for n in ("cogging", "coulomb-friction", "external-push", "cubic-spring")])
+    assert keys(answer.causes) == {("cogging", "q")}
+    assert answer.fit.values["cogging_q_period"] == pytest.approx(2 * np.pi / 5, rel=1e-3)
+    assert abs(answer.fit.values["cogging_q_amplitude"]) == pytest.approx(0.15, rel=0.03)
+
+
+def test_a_number_that_reaches_the_length_of_the_data_is_told_so():
+    model, log = simulated(ROD, [("supply-sag", "u", (0.2, 400.0))], noise=1e-3, seed=2)
+    library, windows = prepared(model, log, [find("supply-sag")])
+    (c,) = library.candidates
+    high = library.bounds(c)[1][1]
+    assert high == pytest.approx((T - 1) * PERIOD)
+    h = library.hypothesis((c,))
+    ended = fit(h, windows, theta=h.theta(dict(zip(library.names(c), (0.4, high), strict=True))), iterations=0)
+    assert f"{high:.4g} s is as long as the data, which tell no longer one from it" in flags(library, c, ended)[0]
 
 
 def test_a_push_that_blows_up_says_nothing_and_breaks_nothing(monkeypatch):

@@ -116,6 +116,41 @@ def test_a_sagging_supply_drains_by_what_it_gave():
     np.testing.assert_allclose(driven(FREE, "supply-sag", "u", LEVELS, sag=0.4, time_constant=0.5)[:, 0], total, atol=1e-12)
 
 
+def test_a_supply_may_sag_for_as_long_as_the_log():
+    effect = gc.registry().build("effect", "supply-sag")
+    scales = {"input": 0.4, "duration": 37.0}
+    times = [t for _, t in effect.grid(scales)]
+    assert effect.parameters[1].bounds(scales) == (0.01, 37.0)
+    assert 0.5 * 37 < max(times) < 37
+    assert max(t for _, t in effect.grid(scales | {"duration": 1.5})) < 1.5
+
+
+def back_and_forth(n=6000, turns=84):
+    """Places of a motion, and teeth there: as many over the range."""
+    t = np.linspace(0, 1, n)
+    place = np.cumsum(np.cos(11 * t) + 0.8 * np.cos(37 * t + 1) + 0.3 * np.cos(71 * t + 2))
+    return place, np.sin(2 * np.pi * turns * place / np.ptp(place) + 0.7)
+
+
+def test_data_suggest_a_period_finer_than_those_that_are_tried():
+    effect, (place, teeth) = gc.registry().build("effect", "cogging"), back_and_forth()
+    noise = np.random.default_rng(3).standard_normal(len(place))
+    found = effect.suggested(place, 0.4 * teeth + noise + 0.5 * np.sign(np.gradient(place)))
+    turns = {round(np.ptp(place) / period, 6) for _, period, _ in found}
+    assert min(abs(n - 84) for n in turns) <= 0.125
+    assert {phase for _, _, phase in found} == {0.0, 0.5 * np.pi}
+
+
+def test_of_noise_and_of_what_is_sampled_too_coarsely_none_is_suggested():
+    effect, (place, teeth) = gc.registry().build("effect", "cogging"), back_and_forth()
+    noise = np.random.default_rng(4).standard_normal(len(place))
+    assert effect.suggested(place, noise) == []
+    assert effect.suggested(place, np.sign(np.gradient(place))) == []
+    assert effect.suggested(place[::30], teeth[::30]) == []
+    assert effect.suggested(place, np.where(place == place[7], np.inf, teeth)) == []
+    assert effect.suggested(place[:0], teeth[:0]) == []
+
+
 def test_dead_zone_saturation_gain_and_offset():
     def gives(name, **numbers):
         return np.diff(driven(FREE, name, "u", LEVELS, **numbers)[:, 0]) / 0.01

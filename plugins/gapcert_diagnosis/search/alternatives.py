@@ -215,9 +215,9 @@ def flags(library: Library, c: Candidate, fitted: Fit) -> tuple[str, ...]:
             turned = not p.dimension and p.off == 1.0 and least <= -value <= most
             out.append(f"{said}; is the sign of {c.site} in the log the other way round than in the model?" if turned else said)
         elif min(value - low[i], high[i] - value) < THRESHOLDS.at_bound * (high[i] - low[i]) and value != off:
-            out.append(
-                f"at the edge: {p.name} = {value:.4g}{unit} is the {'least' if value == low[i] else 'most'} that was tried"
-            )
+            least, most = value == low[i], high[i] < p.high * p.scale(library.scales(c))
+            said = "as long as the data, which tell no longer one from it" if most else "the most that was tried"
+            out.append(f"at the edge: {p.name} = {value:.4g}{unit} is {'the least that was tried' if least else said}")
     return tuple(out)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import final
@@ -56,6 +56,7 @@ class Library:
         self.model, self.measured, self.horizon = model, measured, horizon
         self._extensions: dict[tuple[str, str], Extension] = {}
         self._scales: dict[tuple[str, str], dict[str, float]] = {}
+        self._hints: dict[tuple[str, str], list[tuple[float, ...]]] = {}
         self._made: dict[tuple[tuple[str, str], ...], Hypothesis] = {}
         self._models: dict[tuple[Sequence[tuple[str, str]], Sequence[tuple[str, float]]], Model] = {}
         self._restatements: dict[Sequence[tuple[str, float]], Model] = {}
@@ -185,7 +186,36 @@ class Library:
             return np.array(
                 [[freed.value + s * scale] for s in THRESHOLDS.doubt_starts] if scale is not None else [[freed.value]]
             )
-        return np.array(c.effect.grid(self.scales(c)), dtype=np.float64).reshape(-1, len(c.effect.parameters))
+        values = [*c.effect.grid(self.scales(c)), *self.suggested(c)]
+        return np.array(values, dtype=np.float64).reshape(-1, len(c.effect.parameters))
+
+    def suggested(self, c: Candidate) -> list[tuple[float, ...]]:
+        """First values that the force which the data leave suggests, for an effect that depends on where its site is."""
+        if type(c.effect).suggested is Effect.suggested or not self._places(c):
+            return []
+        with np.errstate(all="ignore"):
+            return once(self._hints, c.key, lambda: [r for seen in self._lacking(c.site) for r in c.effect.suggested(*seen)])
+
+    def needles(self, c: Candidate) -> tuple[str, ...]:
+        """Which of its numbers have optima so narrow that their differences need a step of their own."""
+        return tuple(name for name, p in self.parameters(c).items() if p.step)
+
+    def _lacking(self, site: str) -> Iterator[tuple[Array, Array]]:
+        """(places (n,), force (n,)) that the model lacks at a coordinate: along the smoothed path, and where the place is
+        measured by its second differences, in which nothing is blunted, and noise is loud.
+        """
+        x, m = self._path[0], self.measured
+        response, name = sliding(self.model, site, *self._path, self.plain), position(self.model, site) or site
+        v, at = velocity(self.model, site, response), [s.name for s in self.model.states].index(name)
+        rows = np.delete(np.arange(len(x)), np.cumsum([len(s) for s in m.states]) - 1)
+        yield x[rows, at], ((x[rows + 1, v] - x[rows, v]) / m.repeat - self.moved[0][rows, v]) / response[rows, v]
+        channel = [i for i, s in enumerate(m.channels) if s.name == name and s.name in self.model.coordinates]
+        if channel:
+            inner = np.setdiff1d(rows, np.cumsum([0, *(len(s) for s in m.states)]))
+            y, seen = (np.concatenate(a)[:, channel[0]] for a in (m.outputs, m.weights))
+            inner = inner[(seen[inner - 1] > 0) & (seen[inner] > 0) & (seen[inner + 1] > 0)]
+            bent = (y[inner + 1] - 2 * y[inner] + y[inner - 1]) / m.period**2 * self.model.period
+            yield x[inner, at], (bent - self.moved[0][inner, v]) / response[inner, v]
 
     def amplitude(self, c: Candidate) -> int | None:
         """Which parameter the effect is linear in."""
@@ -257,7 +287,10 @@ class Library:
                 rows.append((stated.name, stated.value, low[0], high[0], step, math.inf))
                 continue
             for i, (name, e) in enumerate(self.parameters(c).items()):
-                rows.append((name, e.off, low[i], high[i], _step(e, e.scale(self.scales(c))), math.inf))
+                # Numbers that are suggested side by side are as many needles.
+                apart = np.diff(np.unique([row[i] for row in self.suggested(c)])).min(initial=math.inf)
+                step = min(_step(e, e.scale(self.scales(c))), THRESHOLDS.needle_step * apart if e.step else math.inf)
+                rows.append((name, e.off, low[i], high[i], step, math.inf))
         names = tuple(r[0] for r in rows)
         return Hypothesis(model, names, *np.array([r[1:] for r in rows], dtype=np.float64).reshape(-1, 5).T)
 

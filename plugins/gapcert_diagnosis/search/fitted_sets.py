@@ -7,8 +7,10 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import final
 
+import numpy as np
+
 from gapcert_diagnosis.data.dataset import Windows, once
-from gapcert_diagnosis.fitting.fit import Fit, carried, fit, rescued
+from gapcert_diagnosis.fitting.fit import Fit, carried, fit, promising, rescued
 from gapcert_diagnosis.fitting.rollout_error import Stretches
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
@@ -115,7 +117,23 @@ class FittedSets:
         for factor in THRESHOLDS.shakes if dry and not noise(best) else ():
             shaken = {n: v * factor if n in dry else v for n, v in best.values.items()}
             self.fit_again(causes, None, shaken)
+        for c in causes if not noise(best) else ():
+            if (start := self._elsewhere(c, best)) is not None:
+                self.fit_again(causes, None, start)
         return self._fits[keys(causes)][1]
+
+    def _elsewhere(self, c: Candidate, best: Fit) -> dict[str, float] | None:
+        """The numbers of a fit with the most promising of those that data suggest for a cause, away from its own: each is a
+        needle, and beside it are others.
+        """
+        names, h, known = self.library.names(c), best.hypothesis, best.values
+        rows = [dict(zip(names, row, strict=True)) for row in self.library.suggested(c)]
+        rows = [r for r in rows if any(abs(r[n] - known[n]) > 12 * h.step[h.names.index(n)] for n in self.library.needles(c))]
+        if not rows:
+            return None
+        turned = [r | {n: sign * r[n] for n in [names[self.library.amplitude(c) or 0]]} for r in rows for sign in (1, -1)]
+        theta = promising(h, self.windows, np.array([h.theta(known | r) for r in turned]), best.start)[0]
+        return dict(zip(h.names, theta.tolist(), strict=True))
 
     def brief(self, base: Found) -> Fit:
         """The set of a long fit, fitted to the short windows."""

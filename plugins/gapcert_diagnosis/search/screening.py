@@ -70,7 +70,8 @@ class Screen:
                 for name, off, column in zip(self.library.names(c), self.library.off(c), rows.T, strict=True):
                     given[name] = np.full(int(ends[-1]), off)
                     given[name][first : first + len(rows)] = column
-            state = self._moved(self.library.shared(members[0]), given, int(ends[-1]))
+            fine = any(map(self.library.suggested, members))
+            state = self._moved(self.library.shared(members[0]), given, int(ends[-1]), fine=fine)
             for c, rows, first in zip(members, values, ends, strict=False):
                 own = np.ascontiguousarray(state[..., first : first + len(rows)])
                 self._pushes[c.key] = Push(c, rows, own, None)
@@ -80,11 +81,11 @@ class Screen:
         e = self.library.extension(c)
         return e.output is None and e.output_delay is None and self.library.loosened(c) is None
 
-    def _moved(self, model: Model, given: Mapping[str, Array], count: int) -> Array:
-        """What parameters add to one step along the path, (W, S, nx, count)."""
+    def _moved(self, model: Model, given: Mapping[str, Array], count: int, *, fine: bool) -> Array:
+        """What parameters add to one step along the path, (W, S, nx, count); fine: which may change from sample to sample."""
         m, (w, steps, nx) = self.windows.measured, self.path.x[:, self.path.lead :].shape
-        every = 1 if m.exact or model.hidden else m.repeat * max(1, round(THRESHOLDS.screening_block / m.period))
-        moved, some, off = np.empty((w, steps, nx, count)), max(1, ROWS // w), ("off", id(model))
+        every = 1 if fine or m.exact or model.hidden else m.repeat * max(1, round(THRESHOLDS.screening_block / m.period))
+        moved, some, off = np.empty((w, steps, nx, count)), max(1, ROWS // w), ("off", id(model), every)
         for k in range(0, count, some):
             part = {n: v[k : k + some] for n, v in given.items()}
             new = off not in self._made
@@ -109,7 +110,8 @@ class Screen:
         if not self._moving(c):
             shown = [self.path.output(model, dict(zip(names, row, strict=True))) for row in values.tolist()]
             return Push(c, values, None, np.stack([difference(channels, y, self._shown(model)) for y in shown], axis=-1))
-        state = self._moved(model, dict(zip(names, values.T, strict=True)), len(values))
+        fine = bool(self.library.suggested(c))
+        state = self._moved(model, dict(zip(names, values.T, strict=True)), len(values), fine=fine)
         return Push(c, values, np.ascontiguousarray(state), None)
 
     def push_at(self, c: Candidate, values: Mapping[str, float]) -> Push:

@@ -97,6 +97,10 @@ class Effect(ABC):
         """
         return list(itertools.product(*([s * p.scale(scales) for s in p.starts] for p in self.parameters)))
 
+    def suggested(self, place: Array, force: Array) -> list[tuple[float, ...]]:
+        """More first values, in their units, that a force (n,) left over at places (n,) of a coordinate suggests."""
+        return []
+
     def canonical(self, values: Mapping[str, float]) -> dict[str, float]:
         """The same effect in the numbers that a report shows, where several sets of numbers mean the same."""
         return dict(values)
