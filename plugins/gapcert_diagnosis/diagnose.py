@@ -22,19 +22,21 @@ from .data.dataset import Dataset, Windows
 from .data.defaults import last_quarter, usual_horizons
 from .experiment import Limits, told_apart
 from .figure import figure
-from .fitting.fit import Fit, fit
+from .fitting.fit import Fit, fit, followed
 from .fitting.rollout_error import Stretches, stretches
 from .fitting.step_size import coarse
 from .residual import unexplained as leftover
 from .residual.adequacy import blind, close
-from .results import Cause, Diagnosis, Estimate, Misfit, Rival
+from .residual.pushes import pushes
+from .results import Cause, Diagnosis, Estimate, Misfit, Push, Rival
 from .search.alternatives import Answer, answered, decided, flags, smallest
 from .search.candidates import Candidate, Library
-from .search.criterion import without
+from .search.criterion import noise, without
 from .search.engine_settings import Setting, Settled, across
 
 T = TypeVar("T")
 U = TypeVar("U")
+PUSH = "external-push"
 _MEASURED = {"input": "{} where it acts", "output": "{} with a second sensor", "coordinate": "the force at {}"}
 
 
@@ -183,14 +185,20 @@ class Spared:
 
 def _searched(problem: DiagnosisProblem) -> Diagnosis:
     """With equations: effects are added to them, and what does not pay is dropped."""
-    data, lap, seed = _Data.of(problem), problem.clock.lap, problem.seed
+    data, lap, seed, spared = _Data.of(problem), problem.clock.lap, problem.seed, Spared()
     lap("evidence")
 
     settled, windows = _settled(data, problem)
     lap("search")
 
     answer = answered(settled.search, settled.found, windows)
-    if settled.settings:
+    pushed = spared("list of pushes", (), _pushes, problem, data, answer)
+    calm = data.calm(problem, pushed) if len(pushed) > sum(c.effect.name == PUSH for c in answer.causes) else None
+    if calm is not None:
+        data, plain, whole = calm, answer.nothing, stretches(data.held, problem.horizons, answer.fit)[-1]
+        settled, windows = _settled(data, replace(problem, effects=[e for e in problem.effects if e.name != PUSH]))
+        answer = replace(answered(settled.search, settled.found, windows), plain=plain)
+    elif settled.settings:
         answer = replace(answer, plain=fit(data.library.hypothesis(()), answer.fit.windows))
     # As the answer holds the inputs, and as its fit finds starts best.
     judges = stretches(replace(data.held, hold=answer.dataset.hold), problem.horizons, answer.fit)
@@ -198,13 +206,14 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
     answer = _largest_first(decided(answer, judge), judge)
     named = tuple(_set(answer, s, judge) for s in settings) + tuple(_named(answer, c, judge) for c in answer.causes)
     named += tuple(_read(answer, c, numbers, judge) for c, numbers in answer.library.seen)
+    if calm is not None:
+        named += _outside(pushed, _share(judge.error(answer.fit), whole.error(answer.fit)))
     lap("rivals")
 
     gain = {f"{j.horizon:g}": j.gains(answer.nothing, answer.fit, seed) for j in judges}
     lap("gain")
     dataset, asked = answer.dataset, problem.experiment
     limits = Limits.of(data.library.model, dataset, asked.get("limits"), asked.get("seconds", 12.0))
-    spared = Spared()
     design, _ = spared("experiment", (None, ()), told_apart, answer.causes, answer.fit, answer.ties, dataset, limits, seed)
     lap("experiment")
     left = leftover.left(data.library.extended(answer.causes, answer.fit.values), answer.fit, seed)
@@ -215,23 +224,27 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
     def near(share: float) -> bool:
         return close(judge, answer.fit, seed, share)
 
+    laws = len(answer.causes) + len(settings) + len(answer.library.seen)
     verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, undecided, odd, near)
+    if pushed and verdict == "nothing":
+        verdict = "unexplained"
     lap("leftover")
     ties = [tuple(c.told for c in tie) for tie, _ in answer.ties]
     ties += [(("engine-setting", s.runner_up.setting),) for s in settings if s.runner_up and s.margin < THRESHOLDS.tie_score]
-    rest = leftover.unexplained(left) if verdict == "unexplained" else None
+    rest = leftover.unexplained(left, pushed) if verdict == "unexplained" else None
     correction = None if rest is None else rest.correction
-    plain = None if answer.plain is None else (f"setting {' and '.join(s.variant.setting for s in settings)}", answer.plain)
+    changed = f"setting {' and '.join(s.variant.setting for s in settings)}"
+    first = (changed, answer.plain) if settings and answer.plain is not None else None
     return Diagnosis(
         verdict,
-        tuple(replace(c, flags=(*c.flags, *leftover.doubts(len(named), left))) for c in named),
+        tuple(replace(c, flags=(*c.flags, *leftover.doubts(laws, left))) for c in named),
         _misfits(answer),
         gain,
-        _extended(answer),
+        _extended(answer, pushed if calm and len(problem.recording.trajectories) == 1 else ()),
         tuple(ties),
         _experiment(answer, design is not None),
         rest,
-        spared("pictures", None, figure, answer.search, answer.causes, answer.fit, judge, design, correction, plain),
+        spared("pictures", None, figure, answer.search, answer.causes, answer.fit, judge, design, correction, first),
         design=design,
         evidence=spared("tests of the residual", {}, leftover.evidence, left),
         negligible=_negligible(answer),
@@ -242,6 +255,7 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
         seconds=limits.seconds if answer.ties and limits.inputs and not design else None,
         warnings=(*coarse(answer.fit), *spared.told),
         refitted=_refitted(answer),
+        pushes=pushed,
     )
 
 
@@ -276,6 +290,28 @@ class _Data:
     held: Dataset
     assumptions: tuple[str, ...]
 
+    def calm(self, problem: DiagnosisProblem, pushed: Sequence[Push]) -> _Data | None:
+        """Between pushes, where these are an effect that may be named, and enough is left between them."""
+        effects = [e for e in problem.effects if e.name != PUSH]
+        if not pushed or len(effects) == len(problem.effects):
+            return None
+        fitted = self.windows.measured.between(_at(pushed, problem.fitted))
+        held = self.held.between(_at(pushed, problem.held_out)) or self.held
+        length = self.windows.length
+        while fitted is not None and length >= THRESHOLDS.usual_samples:
+            try:
+                windows = fitted.windows(length).thinned(THRESHOLDS.fitted_values, THRESHOLDS.guard_windows)
+                windows.guard()
+            except UsageError:
+                length //= 2
+                continue
+            try:
+                stretches(held, problem.horizons)
+            except UsageError:
+                held = self.held
+            return replace(self, library=Library(self.library.model, fitted, effects), windows=windows, held=held)
+        return None
+
     @classmethod
     def of(cls, problem: DiagnosisProblem) -> _Data:
         """UsageError where they are too few, or in other terms."""
@@ -289,6 +325,48 @@ class _Data:
         windows = windows.thinned(THRESHOLDS.fitted_values, THRESHOLDS.guard_windows)
         stretches(held, problem.horizons)  # refuses before the search is paid for
         return cls(library, windows, held, assumed)
+
+
+def _at(pushed: Sequence[Push], recording: Recording) -> list[tuple[int, float, float]]:
+    """(trajectory of a part of the recording, from, until in s) of pushes."""
+    return [
+        (i, p.t, p.t + p.duration)
+        for i, tr in enumerate(recording.trajectories)
+        for p in pushed
+        if tr.name == p.trajectory or tr.name.startswith(f"{p.trajectory} from ")
+    ]
+
+
+def _pushes(problem: DiagnosisProblem, data: _Data, answer: Answer) -> tuple[Push, ...]:
+    """All along the recording, where more than noise is left without them."""
+    named = tuple(c for c in answer.causes if c.effect.name == PUSH)
+    causes = without(answer.causes, named)
+    last = answer.search.fit(causes, (answer.causes, answer.fit)) if named else answer.fit
+    held = data.held
+    if (room := max(len(y) - held.first(i) for i, y in enumerate(held.outputs))) >= THRESHOLDS.window_samples:
+        late = followed(last.hypothesis, last.theta, held.windows(min(last.windows.length, room)))
+        if noise(last) and noise(late, THRESHOLDS.sure_errors):
+            return ()
+    whole = Dataset.of(problem.model, problem.recording)
+    whole = replace(whole, sigma=held.sigma, spread=held.spread, hold=answer.dataset.hold)
+    names = [tr.name for tr in problem.recording.trajectories]
+    law = registry().build("effect", PUSH)
+    return pushes(lambda values: data.library.extended(causes, values), last, whole, names, law)
+
+
+def _outside(pushed: Sequence[Push], explained: float) -> tuple[Cause, ...]:
+    """Pushes as causes, one per site, with the numbers of the largest there."""
+    sites = dict.fromkeys(p.site for p in sorted(pushed, key=lambda p: -p.size))
+    causes = []
+    for largest in (max((p for p in pushed if p.site == s), key=lambda p: p.size) for s in sites):
+        half = largest.force * (largest.high - largest.low) / (2 * largest.size)
+        known = {
+            "force": Estimate.of(largest.sign * largest.force, half, largest.force_unit),
+            "time": Estimate.of(largest.t, 0.0, "s"),
+            "duration": Estimate.of(largest.duration, 0.0, "s"),
+        }
+        causes.append(Cause(PUSH, largest.site, known, explained))
+    return tuple(causes)
 
 
 def _untried(library: Library) -> Iterator[str]:
@@ -408,11 +486,17 @@ def _read(answer: Answer, c: Candidate, numbers: Mapping[str, float], judge: Str
     return Cause(*c.told, known, _share(math.sqrt(left), math.sqrt(before)))
 
 
-def _extended(answer: Answer) -> Model:
+def _extended(answer: Answer, pushed: Sequence[Push] = ()) -> Model:
     library, numbers = answer.library, answer.fit.values
     for _, found in library.seen:
         numbers |= found
-    return library.extended((*answer.causes, *(c for c, _ in library.seen)), numbers)
+    model = library.extended((*answer.causes, *(c for c, _ in library.seen)), numbers)
+    law: Effect = registry().build("effect", PUSH)
+    for p in pushed:
+        e, known = law.extension(p.site, model), (p.sign * p.force, p.t, p.duration)
+        own = tuple(replace(n, value=v) for n, v in zip(e.parameters, known, strict=True))
+        model = model.extend([replace(e, parameters=own)])
+    return model
 
 
 def _negligible(answer: Answer) -> tuple[tuple[str, str, float], ...]:

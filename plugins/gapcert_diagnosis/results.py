@@ -98,12 +98,23 @@ class Misfit:
 @final
 @dataclass(frozen=True)
 class Push:
-    """A single force at `site` that no law in the library makes: its time, its sign and its impulse."""
+    """A short force at `site` that no law in the library makes: in which trajectory, from when (s of the log), for how long.
 
+    size: its impulse, with the 95 % interval [low, high]; force: its mean. Of what is much shorter than the motion only the
+    impulse is known well.
+    """
+
+    trajectory: str
     t: float
+    duration: float
     site: str
     sign: int
     size: float
+    unit: str
+    low: float
+    high: float
+    force: float
+    force_unit: str
 
 
 @final
@@ -203,7 +214,8 @@ class Diagnosis(Shown):
     `nothing`; evidence: tests of the residual by name → channel → number; log: what was repaired in the recording, and how
     its input is held; assumptions: what is taken for granted, in words; seconds: how long the experiments were that were tried
     to tell apart what is `ambiguous_with` the causes, where none does; warnings: what puts the whole answer in doubt, in words;
-    refitted: name → {"stated", "value", "low", "high", "unit"} of the model's parameters that have a tolerance.
+    refitted: name → {"stated", "value", "low", "high", "unit"} of the model's parameters that have a tolerance; pushes: short
+    forces from outside, all along the recording.
     """
 
     verdict: Verdict
@@ -225,6 +237,7 @@ class Diagnosis(Shown):
     seconds: float | None = None
     warnings: tuple[str, ...] = ()
     refitted: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    pushes: tuple[Push, ...] = ()
 
     def sentence(self) -> str:
         """What was found, and what it bought, in one sentence or two."""
@@ -245,6 +258,7 @@ class Diagnosis(Shown):
         out |= {"evidence": {test: dict(channels) for test, channels in self.evidence.items()}} if self.evidence else {}
         out |= {"negligible": [{"effect": e, "site": s, "share": v} for e, s, v in self.negligible]} if self.negligible else {}
         out |= {"smallest": [vars(s).copy() for s in self.smallest]} if self.smallest else {}
+        out |= {"pushes": [vars(p).copy() for p in self.pushes]} if self.pushes else {}
         told: dict[str, Any] = {k: list(getattr(self, k)) for k in ("warnings", "assumptions")}
         told |= {k: dict(getattr(self, k)) for k in ("refitted", "log")}
         return out | {k: v for k, v in told.items() if v} | {"timings": dict(self.timings)}

@@ -309,8 +309,10 @@ def test_pushes_are_told_one_by_one():
     events = found.unexplained.events
     assert found.verdict == "unexplained"
     assert [(e.site, e.sign) for e in events] == [("q", 1), ("q", -1)]
-    assert np.allclose([e.t for e in events], [4.025, 7.025], atol=0.03)
-    assert np.allclose([e.size for e in events], 0.2, rtol=0.2)  # 4 N·m for 50 ms, seen in bins of 30 ms
+    assert np.allclose([e.t + e.duration / 2 for e in events], [4.025, 7.025], atol=0.01)
+    assert np.allclose([e.size for e in events], 0.2, rtol=0.03)  # 4 N·m for 50 ms
+    assert all(0 < e.high - e.low < 0.01 for e in events)
+    assert {(e.trajectory, e.unit, e.force_unit) for e in events} == {("0", "N*m*s", "N*m")}
 
 
 @pytest.mark.parametrize(("law", "seed"), [("spring", 5), ("stiff spring", 4)])

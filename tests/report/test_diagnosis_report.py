@@ -161,7 +161,7 @@ def test_what_is_unexplained_is_no_cause():
          "No dependence on state, input or their past was found; it looks like an external disturbance, most of it at 1.5 to "
          "2 s and 7.25 to 7.5 s."),
         ({"looks_like": {"static": 0.02}}, "external disturbance, about as much all along the recording."),
-        ({"looks_like": {"static": 0.0}, "events": [{}]}, "was found; single pushes from outside explain it."),
+        ({"looks_like": {"static": 0.0}, "events": [{}]}, "was found; single pushes from outside were."),
         ({"looks_like": {"static": 0.4}}, "A function of the present state and input would do"),
         ({"needs_memory": True, "looks_like": {"static": 0.0}}, "It has memory"),
     ],
@@ -172,6 +172,28 @@ def test_what_the_rest_goes_with_is_told_and_that_it_goes_with_nothing(rest, say
     assert says in text
     assert ("would do" in text) == ("would do" in says)
     assert dependence({"needs_memory": False, "where": [[0.0, 1.0]]}) == ""
+
+
+PUSH = {"trajectory": "a.csv", "t": 2.5, "duration": 0.08, "site": "joint2", "sign": -1, "size": 0.31, "unit": "N*m*s",
+        "low": 0.29, "high": 0.33, "force": 3.9, "force_unit": "N*m"}  # fmt: skip
+
+
+def test_pushes_are_told_with_their_times_and_sizes(page):
+    one = {"verdict": "unexplained", "causes": [], "pushes": [PUSH]}
+    assert sentence(one).endswith("Pushes from outside: −0.31 ± 0.02 N·m·s at joint2 from 2.5 s.")
+    second = PUSH | {"trajectory": "b.csv", "t": 4.0, "sign": 1}
+    assert "at joint2 from 2.5 s of a.csv and +0.31 ± 0.02 N·m·s at joint2 from 4 s of b.csv." in sentence(
+        one | {"pushes": [PUSH, second]}
+    )
+    cause = COULOMB | {"effect": "external-push"}
+    assert "Pushes from outside" not in sentence(FOUND | {"causes": [cause], "pushes": [PUSH]})
+    shown = page(verdict="unexplained", unexplained={"needs_memory": False}, pushes=[PUSH, second])
+    for part in ("a.csv", "2.500 s", "0.080 s", "−0.31 ± 0.02 N·m·s", "3.9 N·m"):
+        assert part in whole_text(shown)
+
+
+def whole_text(page):
+    return page.replace("\u00a0", " ").replace("&nbsp;", " ")
 
 
 def recertified(before, after):
@@ -255,13 +277,13 @@ def test_a_refusal_and_a_refutation_are_told(page):
 def test_no_answer_is_called_a_cause_that_is_none(page):
     assert "Causes that were named" in page()
     rest = {
-        "needs_memory": False, "events": [{"t": 2.5, "site": "joint2", "sign": -1, "size": 0.3}], "where": [[2.4, 2.7]],
+        "needs_memory": False, "where": [[2.4, 2.7]],
         "looks_like": {"static": 0.5},
         "correction": {"site": "joint2", "kind": "basis", "terms": {"joint2_dot": -0.2}, "explained": 0.5},
     }  # fmt: skip
-    text = page(verdict="unexplained", unexplained=rest)
+    text = page(verdict="unexplained", unexplained=rest, pushes=[PUSH])
     assert "Causes that were named" not in text
-    for part in ("none of it is shown to be the cause", "2.4 to 2.7 s", "2.50 s", "not a cause; it predicts 50 %"):
+    for part in ("none of it is shown to be the cause", "2.4 to 2.7 s", "2.500 s", "not a cause; it predicts 50 %"):
         assert part in text
     assert "What naming the causes bought" not in page(verdict="nothing", causes=[])
     assert "Why is it wrong?" not in page(verdict="nothing", causes=[])

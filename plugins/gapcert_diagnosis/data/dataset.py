@@ -131,6 +131,26 @@ class Dataset:
         """Samples of a window that is to be short, but long enough to say something."""
         return max(THRESHOLDS.window_samples, self.samples(seconds))
 
+    def between(self, stretches: Sequence[tuple[int, float, float]]) -> Dataset | None:
+        """Without stretches (source, from, until in s): their ends are ends of pieces; None where no window is left."""
+        kept: list[tuple[int, slice]] = []
+        for i, t in enumerate(self.times):
+            out = np.zeros(len(t) + 2, dtype=bool)
+            out[[0, -1]] = True
+            for source, a, b in stretches:
+                out[1:-1] |= (source == self.source[i]) & (t > a - self.period) & (t < b + self.period)
+            edges = np.flatnonzero(np.diff(out))
+            kept += [
+                (i, slice(a, b)) for a, b in edges.reshape(-1, 2).tolist() if b - a > self.history + THRESHOLDS.window_samples
+            ]
+        if not kept:
+            return None
+        each = ("times", "outputs", "inputs", "states", "weights", "offsets")
+        parts: dict[str, Any] = {n: tuple(getattr(self, n)[i][part] for i, part in kept) for n in each}
+        fine = [(i, slice(s.start * self.repeat, s.stop * self.repeat)) for i, s in kept]
+        drives = {h: tuple(d[i][part] for i, part in fine) for h, d in self.drives.items()}
+        return replace(self, **parts, drives=drives, source=tuple(self.source[i] for i, _ in kept))
+
     def first(self, piece: int) -> int:
         """The first sample of a piece at which a window may begin."""
         since = self.since[self.source[piece]] if self.since else -math.inf

@@ -185,28 +185,22 @@ def doubts(causes: int, found: Left) -> tuple[str, ...]:
     return tuple(out)
 
 
-def unexplained(found: Left) -> Unexplained:
-    """The kind of what is left, where it is, single pushes, and a formula where a law of the present state would do."""
+def unexplained(found: Left, events: tuple[Push, ...] = ()) -> Unexplained:
+    """The kind of what is left, where it is, pushes that were found, and a formula where a law of the state would do."""
     where, best = _where(found.short), found.best
     if best is None:
-        return Unexplained(False, where=where)
+        return Unexplained(False, events, where=where)
     # That none of them predicts anything is an answer as well.
     kinds = {n: share for n, share in best.kinds.items() if share > 0} or dict(best.kinds)
     if best.memory > THRESHOLDS.learnt_share:
-        return Unexplained(True, looks_like=kinds, where=where)
+        return Unexplained(True, events, looks_like=kinds, where=where)
     if best.share > THRESHOLDS.learnt_share and best in found.learnt:
         formulas = (correction(m, best.site) for m in (found.short, found.long))
         formula = max((f for f in formulas if f is not None), key=lambda f: f.explained, default=None)
-        return Unexplained(False, looks_like=kinds, where=where, correction=formula)
+        return Unexplained(False, events, looks_like=kinds, where=where, correction=formula)
     if best.share > THRESHOLDS.learnt_share:
-        return Unexplained(False, looks_like=kinds, where=where)
-    # A push at the edge of a window hides in its free start, so these windows overlap by half.
-    windows, short = found.short.windows, found.short.fitted
-    overlapping = windows.measured.windows(windows.length, max(1, windows.length // 2))
-    again = fit(short.hypothesis.holding(short.theta), overlapping)
-    motion = Tangent.of(found.short.model, again)
-    events = _single(_pushes(motion, motion.model.sites("coordinate")))
-    return Unexplained(False, events if _quiet(motion, events) else (), kinds, where)
+        return Unexplained(False, events, looks_like=kinds, where=where)
+    return Unexplained(False, events, kinds, where)
 
 
 def _where(motion: Tangent) -> tuple[tuple[float, float], ...]:
@@ -227,48 +221,6 @@ def _where(motion: Tangent) -> tuple[tuple[float, float], ...]:
             stretches.append((t, t + span, size))
     largest = sorted(stretches, key=lambda s: -s[2])[: THRESHOLDS.located_stretches]
     return tuple(sorted((round(a, 6), round(b, 6)) for a, b, _ in largest))
-
-
-def _pushes(motion: Tangent, sites: tuple[str, ...]) -> list[tuple[float, Push]]:
-    """(energy, push) of windows that stand out and that one short force explains."""
-    energy = np.sum(motion.residual**2, axis=1)
-    rows = np.flatnonzero(energy > 8 * np.median(energy))
-    if not 0 < len(rows) <= 0.2 * len(energy):
-        return []
-    steps = motion.x.shape[1]
-    edges = np.linspace(0, steps, THRESHOLDS.push_bins + 1).astype(int)
-    bins = np.digitize(np.arange(steps), edges[1:-1])[:, None] == np.arange(THRESHOLDS.push_bins)
-    found = []
-    for site in sites:
-        columns = motion.responses(site, np.tile(bins.astype(np.float64), (len(energy), 1, 1)))
-        for w in rows.tolist():
-            along = columns[w].T @ motion.residual[w]
-            size = np.sum(columns[w] ** 2, axis=0) + 1e-300
-            j = int(np.argmax(along**2 / size))
-            if (share := float(along[j] ** 2 / size[j] / energy[w])) > THRESHOLDS.push_share:
-                impulse = float(along[j] / size[j] * (edges[j + 1] - edges[j]) * motion.model.period)
-                at = float(motion.windows.t[w] + (edges[j] + edges[j + 1]) / 2 * motion.model.period)
-                found.append((share * energy[w], Push(at, site, 1 if impulse > 0 else -1, abs(impulse))))
-    return found
-
-
-def _quiet(motion: Tangent, events: tuple[Push, ...]) -> bool:
-    """Is the residual noise where no event is near? What is left all over the recording is a law, not events."""
-    span = motion.windows.length * motion.windows.measured.period
-    far = np.ones(len(motion.windows), dtype=bool)
-    for event in events:
-        far &= (event.t < motion.windows.t - THRESHOLDS.push_end) | (event.t > motion.windows.t + span + THRESHOLDS.push_end)
-    rest: Array = motion.residual[far]
-    return bool(rest.size and np.mean(rest**2) < 1.06 + math.sqrt(2 / rest.size))
-
-
-def _single(found: list[tuple[float, Push]]) -> tuple[Push, ...]:
-    """Each push once, in order of time: of those that overlapping windows show, the one with the most energy."""
-    kept: list[Push] = []
-    for _, push in sorted(found, key=lambda f: -f[0]):
-        if all(abs(push.t - k.t) > THRESHOLDS.short_window for k in kept):
-            kept.append(push)
-    return tuple(sorted(kept, key=lambda p: p.t))
 
 
 def evidence(found: Left) -> dict[str, dict[str, float]]:

@@ -17,6 +17,7 @@ from gapcert_report.words.diagnosis import (
     dependence,
     experiment_sentence,
     explained,
+    impulse,
     measured,
     numbers,
     plus_minus,
@@ -207,6 +208,7 @@ def _left(summary: Summary, album: DiagnosisAlbum) -> Html | None:
     return join([
         h("h3", "What is left"),
         _unexplained(summary.get("unexplained")),
+        _pushes(summary.get("pushes", ())),
         table(rms, ("channel", *columns.values()), rows),
         gallery(album.left),
         table(told, ("test", "in", *names), found, 2),
@@ -230,15 +232,22 @@ def _unexplained(rest: Summary | None) -> Html | None:
     if kinds := rest.get("looks_like"):
         rows = [(k.replace("_", " "), f"{100 * v:.0f} %") for k, v in sorted(kinds.items(), key=lambda x: -x[1])]
         parts.append(table("Share that features of each kind predict in data not seen", ("kind", "share"), rows))
-    if events := rest.get("events"):
-        pushes = [(f"{e['t']:.2f} s", e["site"], "+" if e["sign"] > 0 else "−", number(e["size"], 3)) for e in events]
-        parts.append(table("Single pushes", ("time", "site", "direction", "impulse"), pushes, 3))
     if law := rest.get("correction"):
         terms = [(term, number(v)) for term, v in law["terms"].items()]
         known = f"it predicts {100 * law['explained']:.0f} % of the residual in data not seen"
         caption = f"A correction from data alone at {law['site']}, not a cause; {known}"
         parts.append(table(caption, ("term", "coefficient"), terms))
     return join(parts)
+
+
+def _pushes(pushes: Sequence[Summary]) -> Html | None:
+    rows = [
+        (p["trajectory"], f"{p['t']:.3f} s", f"{p['duration']:.3f} s", p["site"], impulse(p),
+         measured(number(p["force"], 3), p["force_unit"]))
+        for p in pushes
+    ]  # fmt: skip
+    caption = "Pushes from outside, with 95 % intervals of their impulses"
+    return table(caption, ("trajectory", "from", "for", "at", "impulse", "mean force"), rows) if rows else None
 
 
 def _assumed(summary: Summary) -> Html | None:

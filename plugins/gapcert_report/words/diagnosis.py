@@ -93,7 +93,25 @@ def lacking(cause: Summary) -> str:
 def sentence(summary: Summary) -> str:
     """The answer: what the simulation lacks, what naming it bought on data that took no part, and what came second."""
     told = {"nothing": _nothing, "unexplained": _unexplained, "ambiguous": _ambiguous}
-    return told.get(summary["verdict"], _causes)(summary)
+    text, pushes = told.get(summary["verdict"], _causes)(summary), pushes_named(summary)
+    said = summary["verdict"] != "unexplained" and any(c["effect"] == "external-push" for c in summary["causes"])
+    if len(pushes) < 2 and said:
+        return text
+    return f"{text} Pushes from outside: {briefly(pushes, 6)}." if pushes else text
+
+
+def pushes_named(summary: Summary) -> list[str]:
+    """Forces from outside: `−1.28 ± 0.05 rad/s at w from 5.78 s`, with their trajectory where there are several."""
+    pushes = summary.get("pushes", ())
+    several = len({p["trajectory"] for p in pushes}) > 1
+    of = {p["trajectory"]: f" of {p['trajectory']}" if several else "" for p in pushes}
+    return [f"{impulse(p)} at {p['site']} from {number(p['t'], 4)} s{of[p['trajectory']]}" for p in pushes]
+
+
+def impulse(push: Summary) -> str:
+    """Its sign, size, interval and unit."""
+    size = measured(plus_minus(push["size"], push["low"], push["high"]), push["unit"])
+    return f"{'+' if push['sign'] > 0 else '−'}{size}"
 
 
 def _causes(summary: Summary) -> str:
@@ -260,7 +278,7 @@ def dependence(rest: Summary) -> str:
     if not shares:
         return ""
     if rest.get("events"):
-        return "No dependence on state, input or their past was found; single pushes from outside explain it."
+        return "No dependence on state, input or their past was found; single pushes from outside were."
     when = listed([f"{a:.3g} to {b:.3g} s" for a, b in rest.get("where", ())])
     most = f"most of it at {when}" if when else "about as much all along the recording"
     return f"No dependence on state, input or their past was found; it looks like an external disturbance, {most}."
