@@ -24,7 +24,7 @@ from .experiment import Limits, told_apart
 from .figure import figure
 from .fitting.fit import Fit, fit
 from .fitting.rollout_error import Stretches, stretches
-from .fitting.step_size import coarse
+from .fitting.step_size import coarse, settled
 from .residual import unexplained as leftover
 from .results import Cause, Diagnosis, Estimate, Misfit, Rival
 from .search.alternatives import Answer, answered, flags, smallest
@@ -256,11 +256,13 @@ class _Data:
     def of(cls, problem: DiagnosisProblem) -> _Data:
         """UsageError where they are too few, or in other terms."""
         model, (with_past, since) = problem.model, problem.recording.led_up(problem.held_out)
-        library = Library(model, Dataset.of(model, problem.fitted), problem.effects)
+        rough = Dataset.of(model, problem.fitted)
+        model, stepping = settled(model, rough.windows(_length(rough, model, problem.window)))
+        library = Library(model, rough if not stepping else Dataset.of(model, problem.fitted), problem.effects)
         fitted = library.measured
         held = replace(Dataset.of(model, with_past), sigma=fitted.sigma, spread=fitted.spread, since=since)
         _warned(problem.clock.emit, fitted, held)
-        assumed = (*kept_within(model, fitted, held), *_untried(library))
+        assumed = (*stepping, *kept_within(model, fitted, held), *_untried(library))
         windows = fitted.windows(_length(fitted, model, problem.window))
         windows = windows.thinned(THRESHOLDS.fitted_values, THRESHOLDS.guard_windows)
         stretches(held, problem.horizons)  # refuses before the search is paid for
