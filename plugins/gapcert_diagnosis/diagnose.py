@@ -24,7 +24,7 @@ from .experiment import Limits, told_apart
 from .figure import figure
 from .fitting.fit import Fit, fit, followed
 from .fitting.rollout_error import Stretches, stretches
-from .fitting.step_size import coarse
+from .fitting.step_size import coarse, settled
 from .residual import unexplained as leftover
 from .residual.adequacy import blind, close
 from .residual.pushes import pushes
@@ -316,11 +316,14 @@ class _Data:
     def of(cls, problem: DiagnosisProblem) -> _Data:
         """UsageError where they are too few, or in other terms."""
         model, (with_past, since) = problem.model, problem.recording.led_up(problem.held_out)
-        library = Library(model, Dataset.of(model, problem.fitted), problem.effects, max(problem.horizons))
+        rough = Dataset.of(model, problem.fitted)
+        model, stepping = settled(model, rough.windows(_length(rough, model, problem.window)))
+        first = rough if not stepping else Dataset.of(model, problem.fitted)
+        library = Library(model, first, problem.effects, max(problem.horizons))
         fitted = library.measured
         held = replace(Dataset.of(model, with_past), sigma=fitted.sigma, spread=fitted.spread, since=since)
         _warned(problem.clock.emit, fitted, held)
-        assumed = (*kept_within(model, fitted, held), *_untried(library))
+        assumed = (*stepping, *kept_within(model, fitted, held), *_untried(library))
         windows = fitted.windows(_length(fitted, model, problem.window))
         windows = windows.thinned(THRESHOLDS.fitted_values, THRESHOLDS.guard_windows)
         stretches(held, problem.horizons)  # refuses before the search is paid for

@@ -76,6 +76,11 @@ class Thresholds:
     resamples: int = threshold(1000, "of a bootstrap: by the formula, its 95 % ends then vary by 2 % of its width")
     half_step_change: float = chosen(0.5, "of what is left, as root mean squares: more is told as a warning")
     half_step_windows: int = chosen(8, "that are simulated with half the step, spread over the recording")
+    still_rollout: float = chosen(
+        0.02, "noise floors that half the sub-steps may move a rollout by: 5,000 samples sum it up to 2 of Σ r²"
+    )
+    most_substeps: int = chosen(128, "times the stated ones: the time of a search grows with them")
+    probing_substeps: int = chosen(1000, "of a stated one, in which a rate is measured: an unstable step would not show it")
     fastest_mode: float = threshold(0.5, "rad, step times fastest rate: by the formula, rk4 errs by 1 in 3800 per step")
     tangent_nudge: float = chosen(1e-6, "of a state's size, for slopes of one step: between rounding and curvature")
     regression_block: float = chosen(0.01, "s over which rows are averaged: missing forces are slower")

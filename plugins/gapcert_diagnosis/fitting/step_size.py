@@ -1,4 +1,5 @@
-"""Is a model's own step fine enough for what is left of a recording? An integrator that is not brakes, or drives, by itself."""
+"""Is a model's own step fine enough for a recording, and for what is left of it? An integrator that is not brakes or drives by
+itself, or blows up."""
 
 from __future__ import annotations
 
@@ -7,12 +8,15 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from gapcert.plugin import Array, Model, registry
+from gapcert.plugin import Array, Model, UsageError, difference, registry
+from gapcert_diagnosis.data.dataset import Windows
 from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_engines import EngineModel
 
 from .fit import Fit, followed
+from .hypothesis import Hypothesis
 
 
 def built(section: Mapping[str, Any]) -> Model:
@@ -47,6 +51,56 @@ def fastest(model: Model, x: Array, u: Array) -> float:
         return float(np.abs(np.log(np.linalg.eigvals(slopes).astype(complex))).max())
 
 
+def settled(model: Model, windows: Windows) -> tuple[Model, tuple[str, ...]]:
+    """A model whose sub-steps are halved until its rollouts along a recording stand still, and a sentence that tells them.
+
+    Its own are kept where no mode is fast, and where halving does not end. UsageError where it blows up in so many that an
+    explicit integrator is not for it.
+    """
+    m, part, own = windows.measured, windows.take(_few(windows)), model.substeps
+    finer = None if m.exact else stepped(model, THRESHOLDS.probing_substeps * own)
+    # Of its own step a rate can show as nothing: a map that turns its mode over once has an eigenvalue of one.
+    rate = 0.0 if finer is None else THRESHOLDS.probing_substeps * fastest(finer, part.start, part.u[:, m.history])
+    if not THRESHOLDS.fastest_mode <= rate < np.inf:
+        return model, ()
+    first = y = _rolled(model, part)
+    now, moved = model, np.inf
+    while moved > THRESHOLDS.still_rollout and (n := 2 * now.substeps) <= THRESHOLDS.most_substeps * own:
+        if (fine := stepped(model, n)) is None:
+            return model, ()
+        before, y = y, _rolled(fine, part)
+        with np.errstate(all="ignore"):
+            moved = float(np.nan_to_num(np.sqrt(np.mean((difference(m.channels, y, before) / m.sigma) ** 2)), nan=np.inf))
+        now = fine if moved > THRESHOLDS.still_rollout else now
+    time = model.period / own / rate
+    if not np.isfinite(y).all() and rate > THRESHOLDS.most_substeps:
+        need, most = f"{m.period / time:.2g}", THRESHOLDS.most_substeps * m.repeat
+        raise UsageError(
+            f"model: its fastest mode has a time constant of {time:.2g} s, and samples are {m.period:.6g} s apart; an explicit "
+            f"integrator would need {need} sub-steps between two; expected {most} at most; put the value that the fast state "
+            "settles to in its place, or, if the time of the recording is in ms, say so, recording.units: {TIME: ms}"
+        )
+    lasting = moved <= THRESHOLDS.still_rollout or (np.isfinite(y).all() and not np.isfinite(first).all())
+    if now is model or not lasting:
+        return model, ()
+    told = (
+        f"the model is simulated in sub-steps of {now.period / now.substeps:.3g} s ({now.substeps} in a period, {own} as "
+        f"stated), as its fastest mode has a time constant of {time:.2g} s"
+    )
+    return now, (told,)
+
+
+def _rolled(model: Model, windows: Windows) -> Array:
+    """Outputs (W, L, ny) from the measured starts."""
+    return np.asarray(Hypothesis(model).simulate(windows, np.empty((1, 0)), windows.start[None])[0])
+
+
+def _few(windows: Windows) -> npt.NDArray[np.intp]:
+    """Rows spread over the recording."""
+    count = min(THRESHOLDS.half_step_windows, len(windows))
+    return np.asarray(np.unique(np.linspace(0, len(windows) - 1, count).round().astype(np.intp)))
+
+
 def coarse(last: Fit) -> tuple[str, ...]:
     """A sentence where half the model's step moves a fit by what is not small against what the fit leaves; none otherwise.
 
@@ -56,7 +110,7 @@ def coarse(last: Fit) -> tuple[str, ...]:
     fine = None if windows.measured.exact else stepped(h.model, 2 * h.model.substeps)
     if fine is None:
         return ()
-    rows = np.unique(np.linspace(0, len(windows) - 1, min(THRESHOLDS.half_step_windows, len(windows))).round().astype(np.intp))
+    rows = _few(windows)
     part, start = windows.take(rows), last.start[rows]
     # One without a fast mode is off by its order alone; what it then makes of the motion is no friction.
     if fastest(h.model, start, part.u[:, windows.measured.history]) < THRESHOLDS.fastest_mode:
