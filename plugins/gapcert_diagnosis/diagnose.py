@@ -27,10 +27,11 @@ from .fitting.rollout_error import Stretches, stretches
 from .fitting.step_size import coarse
 from .residual import unexplained as leftover
 from .results import Cause, Diagnosis, Estimate, Misfit, Rival
-from .search.alternatives import Answer, answered, flags, smallest
+from .search.alternatives import Answer, answered, flags
 from .search.candidates import Candidate, Library
 from .search.criterion import keys, without
 from .search.engine_settings import Setting, across
+from .search.visible import smallest
 
 T = TypeVar("T")
 U = TypeVar("U")
@@ -60,21 +61,44 @@ def diagnose(
     and outputs, `seconds`. train: the trajectories that are fitted. A model for which there is a `diagnoser`, such as an engine
     in contact, which is rolled out itself, is left to that; folder: keeps what an interrupted search goes on with.
     """
-    clock = Clock(emit)
-    _timed(model, recording, horizons)
-    parts, copies = _once(recording, hold_out or last_quarter(recording), train, [s.name for s in model.inputs])
-    horizons = usual_horizons(recording, parts[1], [s.name for s in model.outputs]) if horizons is None else horizons
-    more = experiment or {}
-    if copies.found:
-        clock.emit(Event("warning", "recording", {"message": copies.told}))
-    problem = DiagnosisProblem(model, recording, *parts, _effects(effects), horizons, window, more, seed, folder, clock)
-    others = (c.load()() for c in registry().of("diagnoser") if c.missing() is None)
-    answer = next((d.diagnose for d in others if d.accepts(model)), _searched)
-    found = answer(problem)
+    problem, copies = posed(model, recording, effects, hold_out, train, horizons, window, experiment, seed, emit, folder)
+    clock = problem.clock
+    other = rolled_out(model)
+    found = _searched(problem) if other is None else other.diagnose(problem)
     if not copies.found:
         return replace(found, timings=clock.laps)
     log = {**found.log, "copies": copies.summary()}
     return replace(found, timings=clock.laps, assumptions=(*found.assumptions, copies.told), log=log)
+
+
+def posed(
+    model: Model,
+    recording: Recording,
+    effects: Sequence[Effect | str] | Literal["all"] = "all",
+    hold_out: Mapping[str, Any] | None = None,
+    train: Mapping[str, Any] | None = None,
+    horizons: Sequence[float] | None = None,
+    window: float | None = None,
+    experiment: Mapping[str, Any] | None = None,
+    seed: int = 0,
+    emit: Emit = silent,
+    folder: Path | None = None,
+) -> tuple[DiagnosisProblem, Copies]:
+    """The question that `diagnose` answers, with defaults made; and what is in the recording twice."""
+    clock = Clock(emit)
+    _timed(model, recording, horizons)
+    parts, copies = _once(recording, hold_out or last_quarter(recording), train, [s.name for s in model.inputs])
+    horizons = usual_horizons(recording, parts[1], [s.name for s in model.outputs]) if horizons is None else horizons
+    if copies.found:
+        clock.emit(Event("warning", "recording", {"message": copies.told}))
+    more = experiment or {}
+    return DiagnosisProblem(model, recording, *parts, _effects(effects), horizons, window, more, seed, folder, clock), copies
+
+
+def rolled_out(model: Model) -> Diagnoser | None:
+    """The diagnoser that answers for a model in place of the search with equations, if there is one."""
+    others = (c.load()() for c in registry().of("diagnoser") if c.missing() is None)
+    return next((d for d in others if d.accepts(model)), None)
 
 
 def _once(
@@ -182,7 +206,7 @@ class Spared:
 
 def _searched(problem: DiagnosisProblem) -> Diagnosis:
     """With equations: effects are added to them, and what does not pay is dropped."""
-    data, lap, seed = _Data.of(problem), problem.clock.lap, problem.seed
+    data, lap, seed = Data.of(problem), problem.clock.lap, problem.seed
     lap("evidence")
 
     settled = across(data.library, problem.effects, data.windows, problem.clock.tell)
@@ -241,7 +265,7 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
 
 @final
 @dataclass(frozen=True)
-class _Data:
+class Data:
     """All data of a diagnosis in the terms of its model: what is fitted, as it is read and in windows, and what is held out.
 
     assumptions: what is taken for granted of them, in words.
@@ -253,7 +277,7 @@ class _Data:
     assumptions: tuple[str, ...]
 
     @classmethod
-    def of(cls, problem: DiagnosisProblem) -> _Data:
+    def of(cls, problem: DiagnosisProblem) -> Data:
         """UsageError where they are too few, or in other terms."""
         model, (with_past, since) = problem.model, problem.recording.led_up(problem.held_out)
         library = Library(model, Dataset.of(model, problem.fitted), problem.effects)

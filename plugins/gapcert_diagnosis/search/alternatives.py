@@ -1,4 +1,4 @@
-"""What stands beside the causes: sets that explain as much, runners-up, numbers that are not plausible, what would be seen."""
+"""What stands beside the causes: sets that explain as much, runners-up, numbers that are not plausible."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 
 from gapcert_diagnosis.data.dataset import Dataset, Windows
 from gapcert_diagnosis.fitting.fit import Fit
-from gapcert_diagnosis.results import Seen
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Candidate, Causes, Library
@@ -181,15 +180,4 @@ def flags(library: Library, c: Candidate, fitted: Fit) -> tuple[str, ...]:
             out.append(
                 f"at the edge: {p.name} = {value:.4g}{unit} is the {'least' if value == low[i] else 'most'} that was tried"
             )
-    return tuple(out)
-
-
-def smallest(search: FittedSets) -> tuple[Seen, ...]:
-    """What each effect would have had to be, to be named in these data."""
-    library, out = search.library, []
-    (table,) = search.screen.tables([(search.nothing, 1)])
-    for c in library.candidates:
-        (low, high), row = library.bounds(c), table.least(c, library.charge())
-        if row is not None and (row >= low).all() and (row <= high).all():
-            out.append(Seen(*c.key, c.effect.parameters[0].name, float(row[0]), library.units(c)[0]))
     return tuple(out)
