@@ -9,6 +9,7 @@ from gapcert.plugin import LazyPackage, homes
 _HOME = homes(
     {
         "gapcert_diagnosis.diagnose": "Diagnoser DiagnosisProblem diagnose",
+        "gapcert_diagnosis.preview": "Preview preview previewed",
         "gapcert_diagnosis.results": "ORDER Cause Diagnosis Estimate Gain",
         "gapcert_diagnosis.testing": "EffectContract",
     }

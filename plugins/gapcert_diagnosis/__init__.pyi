@@ -1,6 +1,9 @@
 from gapcert_diagnosis.diagnose import Diagnoser as Diagnoser
 from gapcert_diagnosis.diagnose import DiagnosisProblem as DiagnosisProblem
 from gapcert_diagnosis.diagnose import diagnose as diagnose
+from gapcert_diagnosis.preview import Preview as Preview
+from gapcert_diagnosis.preview import preview as preview
+from gapcert_diagnosis.preview import previewed as previewed
 from gapcert_diagnosis.results import ORDER as ORDER
 from gapcert_diagnosis.results import Cause as Cause
 from gapcert_diagnosis.results import Diagnosis as Diagnosis

@@ -29,10 +29,11 @@ from .residual import unexplained as leftover
 from .residual.adequacy import blind, close
 from .residual.pushes import pushes
 from .results import Cause, Diagnosis, Estimate, Misfit, Push, Rival
-from .search.alternatives import Answer, answered, decided, flags, smallest
+from .search.alternatives import Answer, answered, decided, flags
 from .search.candidates import Candidate, Library
 from .search.criterion import noise, without
 from .search.engine_settings import Setting, Settled, across
+from .search.visible import smallest
 
 T = TypeVar("T")
 U = TypeVar("U")
@@ -63,21 +64,44 @@ def diagnose(
     and outputs, `seconds`. train: the trajectories that are fitted. A model for which there is a `diagnoser`, such as an engine
     in contact, which is rolled out itself, is left to that; folder: keeps what an interrupted search goes on with.
     """
-    clock = Clock(emit)
-    _timed(model, recording, horizons)
-    parts, copies = _once(recording, hold_out or last_quarter(recording), train, [s.name for s in model.inputs])
-    horizons = usual_horizons(recording, parts[1], [s.name for s in model.outputs]) if horizons is None else horizons
-    more = experiment or {}
-    if copies.found:
-        clock.emit(Event("warning", "recording", {"message": copies.told}))
-    problem = DiagnosisProblem(model, recording, *parts, _effects(effects), horizons, window, more, seed, folder, clock)
-    others = (c.load()() for c in registry().of("diagnoser") if c.missing() is None)
-    answer = next((d.diagnose for d in others if d.accepts(model)), _searched)
-    found = answer(problem)
+    problem, copies = posed(model, recording, effects, hold_out, train, horizons, window, experiment, seed, emit, folder)
+    clock = problem.clock
+    other = rolled_out(model)
+    found = _searched(problem) if other is None else other.diagnose(problem)
     if not copies.found:
         return replace(found, timings=clock.laps)
     log = {**found.log, "copies": copies.summary()}
     return replace(found, timings=clock.laps, assumptions=(*found.assumptions, copies.told), log=log)
+
+
+def posed(
+    model: Model,
+    recording: Recording,
+    effects: Sequence[Effect | str] | Literal["all"] = "all",
+    hold_out: Mapping[str, Any] | None = None,
+    train: Mapping[str, Any] | None = None,
+    horizons: Sequence[float] | None = None,
+    window: float | None = None,
+    experiment: Mapping[str, Any] | None = None,
+    seed: int = 0,
+    emit: Emit = silent,
+    folder: Path | None = None,
+) -> tuple[DiagnosisProblem, Copies]:
+    """The question that `diagnose` answers, with defaults made; and what is in the recording twice."""
+    clock = Clock(emit)
+    _timed(model, recording, horizons)
+    parts, copies = _once(recording, hold_out or last_quarter(recording), train, [s.name for s in model.inputs])
+    horizons = usual_horizons(recording, parts[1], [s.name for s in model.outputs]) if horizons is None else horizons
+    if copies.found:
+        clock.emit(Event("warning", "recording", {"message": copies.told}))
+    more = experiment or {}
+    return DiagnosisProblem(model, recording, *parts, _effects(effects), horizons, window, more, seed, folder, clock), copies
+
+
+def rolled_out(model: Model) -> Diagnoser | None:
+    """The diagnoser that answers for a model in place of the search with equations, if there is one."""
+    others = (c.load()() for c in registry().of("diagnoser") if c.missing() is None)
+    return next((d for d in others if d.accepts(model)), None)
 
 
 def _once(
@@ -185,7 +209,7 @@ class Spared:
 
 def _searched(problem: DiagnosisProblem) -> Diagnosis:
     """With equations: effects are added to them, and what does not pay is dropped."""
-    data, lap, seed, spared = _Data.of(problem), problem.clock.lap, problem.seed, Spared()
+    data, lap, seed, spared = Data.of(problem), problem.clock.lap, problem.seed, Spared()
     lap("evidence")
 
     settled, windows = _settled(data, problem)
@@ -259,7 +283,7 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
     )
 
 
-def _settled(data: _Data, problem: DiagnosisProblem) -> tuple[Settled, Windows]:
+def _settled(data: Data, problem: DiagnosisProblem) -> tuple[Settled, Windows]:
     """What a search found, and in which windows.
 
     In longer ones where the usual ones are blind to what rollouts over the longest horizon show, and where it is found there.
@@ -279,7 +303,7 @@ def _settled(data: _Data, problem: DiagnosisProblem) -> tuple[Settled, Windows]:
 
 @final
 @dataclass(frozen=True)
-class _Data:
+class Data:
     """All data of a diagnosis in the terms of its model: what is fitted, as it is read and in windows, and what is held out.
 
     assumptions: what is taken for granted of them, in words.
@@ -290,7 +314,7 @@ class _Data:
     held: Dataset
     assumptions: tuple[str, ...]
 
-    def calm(self, problem: DiagnosisProblem, pushed: Sequence[Push]) -> _Data | None:
+    def calm(self, problem: DiagnosisProblem, pushed: Sequence[Push]) -> Data | None:
         """Between pushes, where these are an effect that may be named, and enough is left between them."""
         effects = [e for e in problem.effects if e.name != PUSH]
         if not pushed or len(effects) == len(problem.effects):
@@ -313,7 +337,7 @@ class _Data:
         return None
 
     @classmethod
-    def of(cls, problem: DiagnosisProblem) -> _Data:
+    def of(cls, problem: DiagnosisProblem) -> Data:
         """UsageError where they are too few, or in other terms."""
         model, (with_past, since) = problem.model, problem.recording.led_up(problem.held_out)
         rough = Dataset.of(model, problem.fitted)
@@ -340,7 +364,7 @@ def _at(pushed: Sequence[Push], recording: Recording) -> list[tuple[int, float, 
     ]
 
 
-def _pushes(problem: DiagnosisProblem, data: _Data, answer: Answer) -> tuple[Push, ...]:
+def _pushes(problem: DiagnosisProblem, data: Data, answer: Answer) -> tuple[Push, ...]:
     """All along the recording, where more than noise is left without them."""
     named = tuple(c for c in answer.causes if c.effect.name == PUSH)
     causes = without(answer.causes, named)

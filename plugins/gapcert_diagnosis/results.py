@@ -195,13 +195,19 @@ class Experiment:
 @final
 @dataclass(frozen=True)
 class Seen:
-    """The smallest value of an effect's first parameter that these data would have shown, where nothing was found."""
+    """The smallest size of an effect that these data would show: the value of one of its parameters.
+
+    share: of the effort at its site, of the spread of an output, or of a stated value, where it does most. off: the value at
+    which the effect does nothing, where that is neither zero nor beyond all bounds.
+    """
 
     effect: str
     site: str
     parameter: str
     value: float
     unit: str
+    share: float = float("nan")
+    off: float | None = None
 
 
 @final

@@ -48,6 +48,24 @@ class Thresholds:
     backward_rows: float = chosen(0.2, "share of rows that go back in time: a clock that is set back so often is none")
     lost_spread: float = chosen(0.5, "of a channel's spread: a simulation that is further off in all channels follows nothing")
     lost_floor: float = chosen(50.0, "mean square in noise floors that such a simulation leaves as well")
+    still_floors: float = chosen(3.0, "noise floors, as the deviation of a position: less is no motion to size anything by")
+    most_speeds: tuple[float, float] = chosen((0.02, 0.98), "quantiles: rare turns of a speed's sign are noise")
+    steady_speed: float = chosen(0.1, "of its mean, as the deviation of a speed: laws of it are then told apart by a tenth")
+    loop_past: tuple[int, int] = chosen(
+        (20, 4), "samples of inputs, which few lines foretell, and of outputs, of which laws need few"
+    )
+    loop_surprise: float = chosen(
+        1e-3, "of an input's deviation: what its past does not tell of it, and noise fed back exceeds"
+    )
+    loop_lines: float = chosen(4.0, "frequencies in an input, per state, from which it is no function of the state by itself")
+    loop_turns: int = chosen(20, "comparisons without feedback: by chance one in twenty logs is above all of them")
+    loop_surprised: float = chosen(0.05, "of what the past of an input does not tell, beyond twice what chance does")
+    loop_share: float = chosen(0.5, "of the changes of an input, that the state tells")
+    loop_change: float = chosen(0.02, "s: over less, changes are noise, over more, what is commanded")
+    loop_jump: float = chosen(8.0, "times the median change of an input: more is a command")
+    loop_rest: float = chosen(0.2, "of what is left without feedback: a law that leaves less is no chance")
+    loop_samples: int = chosen(4000, "of one stretch, that are simulated without feedback: seconds, not minutes")
+    loop_cutoff: float = chosen(1e-10, "relative singular value of regressors below which rounding tells them apart")
     # fitting
     blown_residual: float = chosen(1e6, "noise floors that a simulation which blew up is charged with, per sample")
     wildest_residual: float = threshold(1e100, "noise floors: beyond 1e154 a square is no float64; it has blown up long before")
@@ -275,6 +293,8 @@ class Thresholds:
     guard_share: float = threshold(0.15, "of the excess over noise: measured, a wrong cause won 3.4 %, a right set 97 %")
     late_residual: float = chosen(1.5, "times that of the earlier windows, from which later ones may hold a push of their own")
     calm_residual: float = chosen(1.02, "times that of the earlier windows, that a law of the later ones may make of it")
+    smaller_sizes: float = chosen(0.7, "of the next one, of laws that are linear in no number: sizes are told to a third")
+    smaller_rungs: int = chosen(12, "of these below the least of a grid, which is down to a seventieth")
     adequate_residual: float = chosen(1.2, "per noise floor of later data that no simpler law has to improve")
 
 

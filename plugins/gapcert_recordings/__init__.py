@@ -10,7 +10,7 @@ _HOME = homes(
     {
         "gapcert_recordings.copies": "Copies Copy",
         "gapcert_recordings.experiment": "play",
-        "gapcert_recordings.inspect": "Column Table in_words inspect not_numbers sentence",
+        "gapcert_recordings.inspect": "Column Table flawed in_words inspect not_numbers sentence",
         "gapcert_recordings.resampling": "JITTER Log Piece pieces repairs",
         "gapcert_recordings.transitions": "Transitions axes",
     }

@@ -3,6 +3,7 @@ from gapcert_recordings.copies import Copy as Copy
 from gapcert_recordings.experiment import play as play
 from gapcert_recordings.inspect import Column as Column
 from gapcert_recordings.inspect import Table as Table
+from gapcert_recordings.inspect import flawed as flawed
 from gapcert_recordings.inspect import in_words as in_words
 from gapcert_recordings.inspect import inspect as inspect
 from gapcert_recordings.inspect import not_numbers as not_numbers

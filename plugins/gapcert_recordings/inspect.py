@@ -13,6 +13,7 @@ import numpy as np
 from gapcert import Array, MissingDependency, Recording, StateSpec, Trajectory, UsageError
 from gapcert.plugin import SHORTEST, Reader, as_numbers, first_text, harmless, seconds, stated_units
 
+from .flaws import flaws
 from .resampling import Log, pieces, readings
 
 TIMES = ("t", "time", "timestamp", "(time)", "stamp", "times", "t_s", "time_s")
@@ -22,8 +23,8 @@ _WITH_UNIT = re.compile(r"(.*\S)\s*(?:\[\s*(s|ms|us|Âµs|ns)\s*\]|\(\s*(s|ms|us|Â
 @final
 @dataclass(frozen=True)
 class Column:
-    """One column: its values (n,), how many are missing or absurd, range, standard deviation, noise floor, and the step of
-    its values where they lie on a lattice."""
+    """One column: its values (n,), how many are missing or absurd, range, standard deviation, noise floor, the step of its
+    values where they lie on a lattice, and what is wrong with its sensor, in words."""
 
     name: str
     values: Array
@@ -35,6 +36,7 @@ class Column:
     noise: float | None = None
     step: float | None = None
     unit: str = ""
+    flaws: tuple[str, ...] = ()
 
     @property
     def title(self) -> str:
@@ -45,7 +47,7 @@ class Column:
         """As plain data."""
         kept = ("name", "unit", "low", "high", "spread", "noise", "step", "missing", "outliers")
         found = {k: getattr(self, k) for k in kept}
-        return {k: None if v != v else v for k, v in found.items()}
+        return {k: None if v != v else v for k, v in found.items()} | {"flaws": list(self.flaws)}
 
 
 @final
@@ -184,7 +186,7 @@ def _column(name: str, t: Array, values: Array, unit: str, logs: list[Log]) -> C
         outliers = log.outliers.get(name, 0)
         logs.append(log)
     missing = int(np.sum(~np.isfinite(values)))
-    return Column(name, values, missing, outliers, *facts, noise, _step(there), unit)
+    return Column(name, values, missing, outliers, *facts, noise, _step(there), unit, tuple(flaws(t, values)))
 
 
 def _step(values: Array) -> float | None:
@@ -210,9 +212,15 @@ def in_words(tables: Sequence[Table]) -> list[str]:
             for c in table.columns
         ]
         lines += [f"  {line}" for line in columns(head, rows)] if rows else []
+        lines += [f"  {told}" for told in flawed(table)]
         lines += [f"  {not_numbers(table)}"] if table.text else []
         lines.append("")
     return lines
+
+
+def flawed(table: Table) -> list[str]:
+    """What is wrong with its sensors: `q stays at its greatest value, 1.2, in 8 % of the samples: ...`."""
+    return [f"{c.name} {told}" for c in table.columns for told in c.flaws]
 
 
 def not_numbers(table: Table) -> str:

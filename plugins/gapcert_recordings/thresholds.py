@@ -45,6 +45,11 @@ class Thresholds:
     copies_told: int = chosen(3, "by name: a recording may hold many, and a program reads all of them")
     form_values: int = chosen(400, "of a channel tell with how many digits it is written")
     hole_step: float = chosen(1.5, "of the period: longer steps of time are holes")
+    flaw_samples: int = chosen(30, "at least, in a column of which anything is told")
+    clipped_samples: int = chosen(3, "in a row at the end of a range: a turning point has fewer")
+    clipped_speed: float = chosen(0.3, "of the usual step, with which a value that is cut off comes to the end of its range")
+    stuck_samples: int = chosen(8, "in a row that are the same, of a sensor whose noise shows in every other one")
+    even_runs: float = chosen(0.9, "of the values, that are held as long as most are")
     hole_ends: int = chosen(5, "samples on either side of a hole that tell how fast it turns there")
 
 

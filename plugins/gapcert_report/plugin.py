@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from gapcert.plugin import LOG, RUN, Argument, Component, hookimpl
+from gapcert.plugin import ALLOW_CODE, LOG, RUN, Argument, Component, hookimpl
 
 _VIEWS = {
     "Certificate": ("Certificate", "a certificate in a line and in a notebook"),
@@ -23,11 +23,12 @@ def gapcert_components() -> list[Component]:
         Component(
             "command",
             "inspect",
-            "show what is in a log: rates, gaps, ranges, noise; with a page of plots",
+            "show what is in a log: rates, gaps, ranges, noise; of a spec, what it could show; with a page of plots",
             "gapcert_report.commands:inspect",
             arguments=(
                 LOG,
                 Argument("--out", "where the page goes (runs)", {"type": Path, "default": Path("runs"), "metavar": "DIR"}),
+                ALLOW_CODE,
             ),
         ),
         Component(

@@ -1,4 +1,4 @@
-"""What stands beside the causes: sets that explain as much, runners-up, numbers that are not plausible, what would be seen."""
+"""What stands beside the causes: sets that explain as much, runners-up, numbers that are not plausible."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import numpy as np
 from gapcert_diagnosis.data.dataset import Dataset, Windows
 from gapcert_diagnosis.fitting.fit import Fit
 from gapcert_diagnosis.fitting.rollout_error import Stretches
-from gapcert_diagnosis.results import Seen
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Candidate, Causes, Library
@@ -218,15 +217,4 @@ def flags(library: Library, c: Candidate, fitted: Fit) -> tuple[str, ...]:
             least, most = value == low[i], high[i] < p.high * p.scale(library.scales(c))
             said = "as long as the data, which tell no longer one from it" if most else "the most that was tried"
             out.append(f"at the edge: {p.name} = {value:.4g}{unit} is {'the least that was tried' if least else said}")
-    return tuple(out)
-
-
-def smallest(search: FittedSets) -> tuple[Seen, ...]:
-    """What each effect would have had to be, to be named in these data."""
-    library, out = search.library, []
-    (table,) = search.screen.tables([(search.nothing, 1)])
-    for c in (c for c in library.candidates if not c.effect.variant_of):
-        (low, high), row = library.bounds(c), table.least(c, library.charge())
-        if row is not None and (row >= low).all() and (row <= high).all():
-            out.append(Seen(*c.told, c.effect.parameters[0].name, float(row[0]), library.units(c)[0]))
     return tuple(out)

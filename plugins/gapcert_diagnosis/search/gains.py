@@ -101,6 +101,12 @@ class GainTable:
         normal[pinned], normal[:, pinned] = 0.0, 0.0
         return np.asarray(np.linalg.pinv(normal, hermitian=True))
 
+    def without(self, numbers: Sequence[int]) -> Array:
+        """The inverse of the normal equations with these free numbers held."""
+        held = self.pinned.copy()
+        held[list(numbers)] = True
+        return self._inverse(self.precision, held)
+
     def enter(self, pushes: Sequence[Push]) -> None:
         """The columns of candidates, many in one pass; beside those that are there already."""
         moving = [p for p in pushes if p.state is not None]
@@ -230,33 +236,16 @@ class GainTable:
         column = self.columns[c.key]
         return np.asarray(column.values[int(np.argmax(column.gain))])
 
-    def least(self, c: Candidate, gain: float) -> Array | None:
-        """The smallest values of a candidate that promise so much, had they been there; None where none does."""
-        freed, scale = self.library.loosened(c), np.sqrt(gain / float(self.fit.whiteness.min()))
-        if freed is not None:
-            return self._least_freed(freed, scale)
-        values = self.columns[c.key].values
-        curve = np.sqrt(np.maximum(self.columns[c.key].curve, 1e-300))
-        k = self.library.amplitude(c)
-        if k is None:
-            off, enough = self.library.off(c)[0], np.flatnonzero(curve > scale)
-            if not len(enough):
-                return None
-            return np.asarray(values[enough[np.argmin(np.abs(values[enough, 0] - off))]])
-        i, off = int(np.argmax(curve)), self.library.off(c)[k]
-        least: Array = values[i].copy()
-        least[k] = off + (least[k] - off) * scale / curve[i]
-        return least
-
-    def _least_freed(self, name: str, scale: float) -> Array | None:
-        """Off the stated value: what it costs the prior, and the data where they hold it."""
-        names = self.fit.hypothesis.names
+    def least_freed(self, c: Candidate, gain: float) -> Array | None:
+        """The smallest value beyond the stated one that promises so much, by the prior, and by the data where they hold it."""
+        (name,), names = self.library.names(c), self.fit.hypothesis.names
         if name not in names:
             return None
         k = names.index(name)
         precision = self.precision.copy()
         precision[k] = 0.0
         left = np.linalg.pinv(self.normal + np.diag(precision), hermitian=True)[k, k]
+        scale = np.sqrt(gain / float(self.fit.whiteness.min()))
         return np.array([self.fit.hypothesis.value[k] + scale * np.sqrt(1 / self.precision[k] + left)])
 
     def _bounds(self, c: Candidate, values: Array) -> tuple[float, float]:

@@ -18,6 +18,7 @@ from gapcert_report.words.diagnosis import (
     experiment_sentence,
     explained,
     impulse,
+    least_size,
     measured,
     numbers,
     plus_minus,
@@ -152,7 +153,7 @@ def _ambiguous(summary: Summary) -> Html | None:
 def _smallest(summary: Summary) -> Html | None:
     if not (found := summary.get("smallest", ())):
         return None
-    rows = [(cause_name(s), s["parameter"].replace("_", " "), measured(number(s["value"], 2), s["unit"])) for s in found]
+    rows = [(cause_name(s), s["parameter"].replace("_", " "), least_size(s)) for s in found]
     rest = table("The smallest of each effect that this recording would have shown", ("effect", "parameter", "from"), rows, 2)
     text = f"Had it been there, it would have been seen: {briefly(smallest_named(summary), 4)}."
     return part("What would have been seen", h("p", text), folded(f"All {len(rows)}", rest))

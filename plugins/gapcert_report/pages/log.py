@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gapcert.plugin import Array, __version__, write_atomic
-from gapcert_recordings import Column, Table, not_numbers, sentence
+from gapcert_recordings import Column, Table, flawed, not_numbers, sentence
 from gapcert_report.pictures.svg import BAD, FAINT, WITH, Picture, draw
-from gapcert_report.words.words import number
+from gapcert_report.words.words import Summary, number
 
 from .html import Html, document, framed, gallery, h, table
+from .preview import could_show
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,9 +23,10 @@ BINS = 600  # pieces of time of which the extremes are drawn
 MOST_TABLES, MOST_COLUMNS = 8, 24  # that get pictures
 
 
-def write_log_page(path: Path, name: str, tables: Sequence[Table]) -> Path:
-    """One self-contained file."""
-    sections = [part for i, one in enumerate(tables) for part in _section(i, one)]
+def write_log_page(path: Path, name: str, tables: Sequence[Table], found: Summary | None = None) -> Path:
+    """One self-contained file; found: what a diagnosis could find in it."""
+    sections = [*could_show(found)] if found is not None else []
+    sections += [part for i, one in enumerate(tables) for part in _section(i, one)]
     page = document(name, *framed([h("h1", name)], sections, __version__))
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, page.encode())
@@ -40,6 +42,7 @@ def _section(i: int, one: Table) -> Iterator[Html | None]:
     yield h("h2", one.name)
     yield h("p", sentence(one) + ".")
     yield table("Columns", head, rows, 2)
+    yield from (h("p", f"{told}.") for told in flawed(one))
     if one.text:
         yield h("p", f"N{not_numbers(one)[1:]}.")
     if i < MOST_TABLES:

@@ -221,10 +221,18 @@ def refitted_named(summary: Summary) -> list[str]:
 
 def smallest_named(summary: Summary) -> list[str]:
     """The least of every effect that the data would have shown: `Coulomb friction at q from 0.003 N·m`."""
-    return [
-        f"{spoken(s['effect'])} at {s['site']} from {measured(number(s['value'], 2), s['unit'])}"
-        for s in summary.get("smallest", ())
-    ]
+    return [f"{spoken(s['effect'])} at {s['site']} from {least_size(s)}" for s in summary.get("smallest", ())]
+
+
+def least_size(seen: Summary) -> str:
+    """The smallest size that would be seen: `0.003 N·m`, or `1 ± 0.02` of what does nothing at 1."""
+    if (off := seen.get("off")) is None:
+        return measured(_two_digits(seen["value"]), seen["unit"])
+    return measured(f"{number(off)} ± {_two_digits(abs(seen['value'] - off))}", seen["unit"])
+
+
+def _two_digits(value: float) -> str:
+    return number(float(f"{value:.2g}"))
 
 
 def _ambiguous(summary: Summary) -> str:

@@ -1,0 +1,149 @@
+"""Is an input a function of what is measured? Then a log was made under feedback, which hides what the controller cancels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from gapcert.plugin import Array, Bools, Model, difference
+from gapcert_diagnosis.thresholds import THRESHOLDS
+
+from .dataset import Dataset
+
+
+@final
+@dataclass(frozen=True)
+class Loop:
+    """An input that follows what is measured, the share of it that tells, and the largest such share without feedback.
+
+    by: `surprise`: of what the past of the input does not tell, by what is measured up to then; `state`: of the changes of the
+    input, by those of the state, against the same spectrum played to the model without feedback.
+    """
+
+    input: str
+    by: str
+    share: float
+    chance: float
+
+
+def loops(model: Model, measured: Dataset, seed: int = 0) -> tuple[Loop, ...]:
+    """The inputs that a controller computes from what is measured, as far as the log shows it."""
+    rng, found = np.random.default_rng(seed), []
+    for i, s in enumerate(model.inputs):
+        values = np.concatenate([u[:, i] for u in measured.inputs])
+        if np.ptp(values) <= THRESHOLDS.still * np.abs(values).max():
+            continue
+        share, chance = _surprise(model, measured, i, rng)
+        if share > THRESHOLDS.loop_surprised + 2 * chance:
+            found.append(Loop(s.name, "surprise", share, chance))
+            continue
+        share, chance = _of_state(model, measured, i, rng)
+        if share > THRESHOLDS.loop_share and 1 - share < THRESHOLDS.loop_rest * (1 - chance):
+            found.append(Loop(s.name, "state", share, chance))
+    return tuple(found)
+
+
+def _surprise(model: Model, measured: Dataset, i: int, rng: np.random.Generator) -> tuple[float, float]:
+    """(share, most by chance) of what an input's past does not tell of it that the measurement up to that sample does.
+
+    Without feedback that is nothing. A channel that the input itself may have moved visibly within the sample starts one later.
+    """
+    (own_past, past), m = THRESHOLDS.loop_past, measured
+    late = _at_once(model, m, i)
+    mine, theirs, target = [], [], []
+    for y, u in zip(m.outputs, m.inputs, strict=True):
+        if len(y) <= 4 * own_past:
+            continue
+        rows = np.arange(own_past, len(y))
+        y = np.where(np.isfinite(y), y, 0.0)
+        mine.append(np.hstack([u[rows - k] for k in range(1, own_past + 1)]))
+        theirs.append(np.stack([y[rows - k - late[c], c] for c in range(y.shape[1]) for k in range(past)], axis=1))
+        target.append(u[rows, i])
+    if not target:
+        return 0.0, 0.0
+    own, seen, u = (np.concatenate(a) for a in (mine, theirs, target))
+    own, seen, u = (a[_even(u - own[:, i])] for a in (own, seen, u))
+    if len(u) < THRESHOLDS.usual_samples * own_past:
+        return 0.0, 0.0
+    before = _left(own, u)
+    if before <= THRESHOLDS.loop_surprise**2 * float(np.var(u)):
+        return 0.0, 0.0
+    share = 1 - _left(np.hstack([own, seen]), u) / before
+    turned = [np.roll(seen, int(k), axis=0) for k in rng.integers(len(u) // 4, 3 * len(u) // 4, THRESHOLDS.loop_turns)]
+    return share, max(0.0, *(1 - _left(np.hstack([own, t]), u) / before for t in turned))
+
+
+def _at_once(model: Model, m: Dataset, i: int) -> list[int]:
+    """Per channel 1 where an unforeseen change of the input shows within the sample in which it comes, else 0."""
+    x, u = (np.concatenate(a)[:: max(1, sum(map(len, m.inputs)) // 200)] for a in (m.states, m.inputs))
+    sudden = float(np.sqrt(np.mean(np.concatenate([np.diff(a[:, i]) for a in m.inputs]) ** 2)))
+    on = u + sudden * (np.arange(model.nu) == i)
+    direct = difference(model.outputs, model.output(x, on), model.output(x, u))
+    for _ in range(m.repeat):
+        new, x = model.step(x, on).x, model.step(x, u).x
+    held = difference(model.outputs, model.output(new, u), model.output(x, u))
+    moved = np.sqrt(np.mean(np.maximum(np.abs(direct), np.abs(held)) ** 2, axis=0))[list(m.columns)]
+    return [int(a > THRESHOLDS.same_motion * s) for a, s in zip(moved, m.sigma, strict=True)]
+
+
+def _of_state(model: Model, m: Dataset, i: int, rng: np.random.Generator) -> tuple[float, float]:
+    """(share, most without feedback) of an input that is a linear function of the smoothed state.
+
+    Without feedback: the model under inputs of the same spectrum, whose phases are drawn, from where the recording begins.
+    """
+    piece = int(np.argmax([len(u) for u in m.inputs]))
+    count = min(len(m.inputs[piece]), THRESHOLDS.loop_samples)
+    x, u = m.states[piece][:count], m.inputs[piece][:count]
+    share = _told(x, u[:, i], m)
+    if share < THRESHOLDS.loop_share or model.hidden:
+        return 0.0, 0.0
+    drawn = _surrogates(u, rng)
+    held = np.repeat(drawn, m.repeat, axis=1)[:, : (count - 1) * m.repeat]
+    with np.errstate(all="ignore"):
+        moved = model.fast_rollout(np.repeat(x[:1], len(drawn), axis=0), held, every=m.repeat).x
+    return share, max((_told(a, b[:, i], m) for a, b in zip(moved, drawn, strict=True) if np.isfinite(a).all()), default=0.0)
+
+
+def _surrogates(u: Array, rng: np.random.Generator) -> Array:
+    """Inputs (n, T, nu) with the spectrum, the mean and the cross-spectrum of u (T, nu)."""
+    spectrum = np.fft.rfft(u, axis=0)
+    turns = np.exp(2j * np.pi * rng.random((THRESHOLDS.loop_turns, len(spectrum), 1)))
+    turns[:, 0] = 1.0
+    return np.asarray(np.fft.irfft(spectrum * turns, len(u), axis=1))
+
+
+def _told(x: Array, u: Array, m: Dataset) -> float:
+    """The share of the changes of an input over `loop_change` s that those of the state tell, jumps aside."""
+    lag = m.samples(THRESHOLDS.loop_change)
+    x, u = x[lag:] - x[:-lag], u[lag:] - u[:-lag]
+    rows = _even(u)
+    if np.ptp(u[rows]) <= THRESHOLDS.still * np.ptp(u) or _lines(np.where(rows, u, 0.0)) < THRESHOLDS.loop_lines * x.shape[1]:
+        return 0.0
+    return 1 - _left(x[rows], u[rows]) / max(float(np.var(u[rows])), 1e-300)
+
+
+def _lines(u: Array) -> float:
+    """How many frequencies a signal has: few of them are a function of the state of whatever they drive."""
+    power = np.abs(np.fft.rfft(u - u.mean())) ** 2
+    return float(power.sum() ** 2 / max(float(np.sum(power**2)), 1e-300))
+
+
+def _even(change: Array) -> Bools:
+    """Rows without jumps: a command that is set anew says nothing of the law that follows it."""
+    usual = float(np.median(np.abs(change - np.median(change))))
+    return np.asarray(np.abs(change - np.median(change)) <= THRESHOLDS.loop_jump * usual)
+
+
+def _left(columns: Array, target: Array) -> float:
+    """Mean square of what linear regressions on the other blocks leave of each block."""
+    size = np.std(columns, axis=0)
+    columns = np.hstack([(columns - columns.mean(axis=0)) / np.where(size > 0, size, 1.0), np.ones((len(columns), 1))])
+    fold = np.arange(len(target)) * THRESHOLDS.folds // len(target)
+    left = 0.0
+    for k in range(THRESHOLDS.folds):
+        fit, judge = fold != k, fold == k
+        law = np.linalg.lstsq(columns[fit], target[fit], rcond=THRESHOLDS.loop_cutoff)[0]
+        left += float(np.sum((target[judge] - columns[judge] @ law) ** 2))
+    return left / len(target)
