@@ -20,6 +20,7 @@ from gapcert_recordings import JITTER, Copies, repairs
 from .data.consistency import agreeing, doubt, kept_within, ordered
 from .data.dataset import Dataset, Windows
 from .data.defaults import last_quarter, usual_horizons
+from .data.feedback import loops
 from .experiment import Limits, told_apart
 from .figure import figure
 from .fitting.fit import Fit, fit, followed
@@ -54,6 +55,7 @@ def diagnose(
     seed: int = 0,
     emit: Emit = silent,
     folder: Path | None = None,
+    exact: Sequence[str] = (),
 ) -> Diagnosis:
     """The causes of the difference between a model and a recording.
 
@@ -62,9 +64,11 @@ def diagnose(
     free rollouts over `hold_out` (default: the last quarter), which no fit has seen, at horizons in s (default: of one turn of
     the motion, and of three). experiment: what an experiment may do that tells apart what these data do not: `limits` of inputs
     and outputs, `seconds`. train: the trajectories that are fitted. A model for which there is a `diagnoser`, such as an engine
-    in contact, which is rolled out itself, is left to that; folder: keeps what an interrupted search goes on with.
+    in contact, which is rolled out itself, is left to that; folder: keeps what an interrupted search goes on with. exact:
+    inputs that act as they are logged, such as gains and enables.
     """
-    problem, copies = posed(model, recording, effects, hold_out, train, horizons, window, experiment, seed, emit, folder)
+    given = hold_out, train, horizons, window, experiment, seed, emit, folder, exact
+    problem, copies = posed(model, recording, effects, *given)
     clock = problem.clock
     other = rolled_out(model)
     found = _searched(problem) if other is None else other.diagnose(problem)
@@ -86,6 +90,7 @@ def posed(
     seed: int = 0,
     emit: Emit = silent,
     folder: Path | None = None,
+    exact: Sequence[str] = (),
 ) -> tuple[DiagnosisProblem, Copies]:
     """The question that `diagnose` answers, with defaults made; and what is in the recording twice."""
     clock = Clock(emit)
@@ -95,7 +100,12 @@ def posed(
     if copies.found:
         clock.emit(Event("warning", "recording", {"message": copies.told}))
     more = experiment or {}
-    return DiagnosisProblem(model, recording, *parts, _effects(effects), horizons, window, more, seed, folder, clock), copies
+    if unknown := [n for n in exact if n not in {s.name for s in model.inputs}]:
+        known = ", ".join(s.name for s in model.inputs) or "none"
+        what = f"diagnose.exact: '{unknown[0]}' is no input of the model; expected some of its inputs: {known}"
+        raise UsageError(what, ("diagnose", "exact"))
+    used = _effects(effects)
+    return DiagnosisProblem(model, recording, *parts, used, horizons, window, more, seed, folder, clock, exact), copies
 
 
 def rolled_out(model: Model) -> Diagnoser | None:
@@ -148,6 +158,7 @@ class DiagnosisProblem:
     seed: int
     folder: Path | None
     clock: Clock
+    exact: Sequence[str] = ()
 
 
 class Diagnoser(ABC):
@@ -333,7 +344,7 @@ class Data:
                 stretches(held, problem.horizons)
             except UsageError:
                 held = self.held
-            return replace(self, library=Library(self.library.model, fitted, effects), windows=windows, held=held)
+            return replace(self, library=self.library.under(self.library.model, effects, fitted), windows=windows, held=held)
         return None
 
     @classmethod
@@ -343,11 +354,12 @@ class Data:
         rough = Dataset.of(model, problem.fitted)
         model, stepping = settled(model, rough.windows(_length(rough, model, problem.window)))
         first = rough if not stepping else Dataset.of(model, problem.fitted)
-        library = Library(model, first, problem.effects, max(problem.horizons))
+        library = Library(model, first, problem.effects, max(problem.horizons), problem.exact)
         fitted = library.measured
         held = replace(Dataset.of(model, with_past), sigma=fitted.sigma, spread=fitted.spread, since=since)
         _warned(problem.clock.emit, fitted, held)
-        assumed = (*stepping, *kept_within(model, fitted, held), *_untried(library))
+        looped = (one.told for one in loops(model, fitted, problem.seed))
+        assumed = (*stepping, *kept_within(model, fitted, held), *_untried(library), *looped)
         windows = fitted.windows(_length(fitted, model, problem.window))
         windows = windows.thinned(THRESHOLDS.fitted_values, THRESHOLDS.guard_windows)
         stretches(held, problem.horizons)  # refuses before the search is paid for
@@ -397,7 +409,9 @@ def _outside(pushed: Sequence[Push], explained: float) -> tuple[Cause, ...]:
 
 
 def _untried(library: Library) -> Iterator[str]:
-    """Which effects need a position that the data do not show, in words."""
+    """Which effects need a position that the data do not show, and which inputs never act, in words."""
+    if library.idle:
+        yield f"nothing was tried at {', '.join(library.idle)}, which moves nothing in these data"
     for site, group in itertools.groupby(sorted(library.aside, key=lambda c: c.site), key=lambda c: c.site):
         names = ", ".join(dict.fromkeys(c.told[0] for c in group))
         yield f"effects that depend on where {site} is were not tried, as no output shows how it moves: {names}"

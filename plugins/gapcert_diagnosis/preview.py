@@ -56,7 +56,7 @@ class Preview:
             "unseen": [{"effect": e, "site": s} for e, s in self.unseen],
             "alike": [[{"effect": e, "site": s} for e, s in group] for group in self.alike],
             "unexcited": list(self.unexcited),
-            "feedback": [vars(one) | {"sentence": in_a_loop(one)} for one in self.loops],
+            "feedback": [vars(one) | {"sentence": one.told} for one in self.loops],
             "channels": {n: dict(zip(names, row, strict=True)) for n, row in (self.floors or {}).items()},
         }
 
@@ -83,7 +83,7 @@ def preview(model: Model, recording: Recording, asked: DiagnoseConfig | None = N
     held, train = (
         None if part is None else part.model_dump(exclude_none=True, by_alias=True) for part in (asked.hold_out, asked.train)
     )
-    problem, _ = posed(model, recording, asked.effects, held, train, asked.horizons, asked.window, seed=seed)
+    problem, _ = posed(model, recording, asked.effects, held, train, asked.horizons, asked.window, seed=seed, exact=asked.exact)
     data = Data.of(problem)
     search = FittedSets(data.library, data.windows.guard()[0])
     sight, m = Visible(search), data.library.measured
@@ -125,15 +125,3 @@ def unexcited(model: Model, m: Dataset) -> Iterator[str]:
                 )
             if np.std(np.abs(speed)) < THRESHOLDS.steady_speed * np.mean(np.abs(speed)):
                 yield f"the speed of {q} hardly varies: laws of friction look alike"
-
-
-def in_a_loop(one: Loop) -> str:
-    """What is known of a loop, and what it costs."""
-    told, chance = f"{100 * one.share:.2g} %", f"{100 * one.chance:.2g} %"
-    how = f"what is measured tells {told} of what its own past does not"
-    if one.by == "state":
-        how = f"the state tells {told} of its changes, and {chance} at most without a loop"
-    return (
-        f"{one.input} is under feedback ({how}): what the controller cancels hides in it, and causes look smaller than "
-        "they are where only the held error shows; a log in which it is commanded, or moves faster, shows more"
-    )

@@ -116,6 +116,9 @@ class DiagnoseConfig(Section):
         min_length=1,
         description="lengths of rollouts; the longest is quoted; default: in how long the motion turns once, and three times",
     )
+    exact: list[str] = Field(
+        default_factory=list, description="inputs that act as they are logged (gains, enables): no effect is tried at them"
+    )
     window: Seconds | None = Field(None, description="length of the stretches that are fitted; default: chosen from the data")
     experiment: ExperimentConfig | None = Field(
         None, description="what may be asked of the real system where these data cannot decide"

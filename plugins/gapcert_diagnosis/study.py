@@ -63,6 +63,7 @@ class DiagnosisStudy(Study):
                 train=None if asked.train is None else asked.train.model_dump(exclude_none=True),
                 horizons=None if asked.horizons is None else tuple(asked.horizons),
                 window=asked.window,
+                exact=asked.exact,
                 experiment=None if asked.experiment is None else asked.experiment.model_dump(),
                 seed=c.seed,
                 emit=stages.emit,

@@ -27,6 +27,18 @@ class Loop:
     share: float
     chance: float
 
+    @property
+    def told(self) -> str:
+        """What is known of it, and what it costs."""
+        told, chance = f"{100 * self.share:.2g} %", f"{100 * self.chance:.2g} %"
+        how = f"what is measured tells {told} of what its own past does not"
+        if self.by == "state":
+            how = f"the state tells {told} of its changes, and {chance} at most without a loop"
+        return (
+            f"{self.input} is under feedback ({how}): what the controller cancels hides in it, and causes look smaller than "
+            "they are where only the held error shows; a log in which it is commanded, or moves faster, shows more"
+        )
+
 
 def loops(model: Model, measured: Dataset, seed: int = 0) -> tuple[Loop, ...]:
     """The inputs that a controller computes from what is measured, as far as the log shows it."""

@@ -49,11 +49,14 @@ class Library:
 
     moves: what is added at once: an effect at a site, or the same effect at all its sites; seen: what shows in the measured
     values alone, with its numbers, and needs no fit; measured: the data, with what is seen in the noise floor; aside: what
-    depends on a position that no output shows, or that never moves; horizon: in s, of the longest rollouts that matter.
+    depends on a position that no output shows, or that never moves; horizon: in s, of the longest rollouts that matter; exact:
+    inputs that act as they are logged.
     """
 
-    def __init__(self, model: Model, measured: Dataset, effects: Sequence[Effect], horizon: float = 0.0) -> None:
-        self.model, self.measured, self.horizon = model, measured, horizon
+    def __init__(
+        self, model: Model, measured: Dataset, effects: Sequence[Effect], horizon: float = 0.0, exact: Sequence[str] = ()
+    ) -> None:
+        self.model, self.measured, self.horizon, self.exact = model, measured, horizon, exact
         self._extensions: dict[tuple[str, str], Extension] = {}
         self._scales: dict[tuple[str, str], dict[str, float]] = {}
         self._hints: dict[tuple[str, str], list[tuple[float, ...]]] = {}
@@ -72,13 +75,27 @@ class Library:
         self._contains = {e.name: set(e.contains) for e in effects}
         self.moves = (*((c,) for c in self.candidates), *self._everywhere())
 
-    def under(self, model: Model, effects: Sequence[Effect] = ()) -> Library:
-        """Of another model, of the same data."""
-        return Library(model, self.measured, effects, self.horizon)
+    def under(self, model: Model, effects: Sequence[Effect] = (), measured: Dataset | None = None) -> Library:
+        """Of another model, or of other data."""
+        return Library(model, measured or self.measured, effects, self.horizon, self.exact)
+
+    @cached_property
+    def idle(self) -> tuple[str, ...]:
+        """Inputs that move no state and no output, wherever the data are."""
+        rows = np.unique(np.linspace(0, len(self._path[0]) - 1, THRESHOLDS.swept_points).astype(np.intp))
+        (x, u), m, out = (a[rows] for a in self._path), self.model, list[str]()
+        still = ~np.any(m.jacobian(x, u)[:, :, m.nx :], axis=(0, 1))
+        for i in np.flatnonzero(still).tolist():
+            near = u + THRESHOLDS.tangent_nudge * max(1.0, float(np.abs(u[:, i]).max())) * (np.arange(m.nu) == i)
+            if not np.any(difference(m.outputs, m.output(x, near), m.output(x, u))):
+                out.append(m.inputs[i].name)
+        return tuple(out)
 
     def _possible(self, c: Candidate) -> bool:
         """Does the effect apply, can the data show it, and is there a tolerance that can be lifted?"""
         if c.effect.site == "output" and c.site not in {s.name for s in self.measured.channels}:
+            return False
+        if c.effect.site == "input" and c.site in (*self.exact, *self.idle):
             return False
         if not c.effect.applies(c.site, self.model):
             return False
