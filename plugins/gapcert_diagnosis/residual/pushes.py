@@ -125,7 +125,7 @@ def _strongest(model: Model, last: Fit, measured: Dataset, length: int) -> Itera
     most = np.stack([g[row, k] for g, k in zip(gain, best, strict=True)], axis=-1)
     gains = most.max(axis=1)
     rest = max(1.0, float(np.median((energy - gains) / np.maximum(np.sum(windows.weight**2, axis=(1, 2)), 1))))
-    chance = rest * charge(len(sites) * len(first) * len(row))
+    chance = THRESHOLDS.push_beyond * rest * charge(len(sites) * len(first) * len(row))
     plain = gains > THRESHOLDS.push_share * (energy - np.median(energy))
     for w, t in enumerate(windows.t.tolist()):
         forces = {}
