@@ -13,12 +13,13 @@ from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.experiment import Limits, told_apart
 from gapcert_diagnosis.search import gains
 from gapcert_diagnosis.search import screening as screen
-from gapcert_diagnosis.search.alternatives import answered, flags, smallest
+from gapcert_diagnosis.search.alternatives import answered, flags
 from gapcert_diagnosis.search.candidates import Library
-from gapcert_diagnosis.search.criterion import better, keys, richer
+from gapcert_diagnosis.search.criterion import keys, richer
 from gapcert_diagnosis.search.fitted_sets import FittedSets
 from gapcert_diagnosis.search.moves import spared, swaps
 from gapcert_diagnosis.search.stepwise import EquationSearch, drop_unconfirmed, search_windows
+from gapcert_diagnosis.search.visible import smallest
 from gapcert_diagnosis.testing import ROD, equations
 
 T, PERIOD = 1400, 0.01
@@ -281,7 +282,8 @@ def test_what_would_have_been_seen_is_of_the_size_that_is_seen():
         _, hidden = simulated(LOOSE, [("viscous-friction", "q", (factor * least.value,))])
         search = FittedSets(*prepared(model, hidden))
         (c,) = (c for c in library.candidates if c.effect.name == "viscous-friction")
-        assert (better(search.fit((c,), ((), search.nothing)), search.nothing) > library.charge()) == seen
+        found, nothing = ((c,), search.fit((c,), ((), search.nothing))), ((), search.nothing)
+        assert (search.pays(found, nothing) and search.matters(found)) == seen
 
 
 def test_values_that_are_not_plausible_are_flagged():
