@@ -111,7 +111,7 @@ def printed(capsys):
 
 
 def test_every_section_has_a_shape():
-    assert SHAPES.keys() == {"run", "diagnose", "compare", "verify", "check", "plugins"}
+    assert SHAPES.keys() == {"run", "diagnose", "inspect", "compare", "verify", "check", "plugins"}
 
 
 def test_a_run_is_shaped_as_the_page_says(printed, small_run, tmp_path):
@@ -131,6 +131,9 @@ def test_a_diagnosis_is_shaped_as_the_page_says(printed, tmp_path):
     found = printed("diagnose", PENDULUM, "--out", tmp_path, *(part for one in QUICK for part in ("--set", one)))
     assert found["verdict"] == "causes"
     assert list(strangers(found, shape_below(SHAPES["diagnose"]))) == []
+    looked = printed("inspect", PENDULUM, "--out", tmp_path)
+    assert looked["could_show"]["seen"]
+    assert list(strangers(looked, shape_below(SHAPES["inspect"]))) == []
 
 
 def test_a_comparison_is_shaped_as_the_page_says(printed, small_spec, tmp_path):

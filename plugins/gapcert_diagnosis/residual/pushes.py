@@ -127,6 +127,9 @@ def _strongest(model: Model, last: Fit, measured: Dataset, length: int) -> Itera
     rest = max(1.0, float(np.median((energy - gains) / np.maximum(np.sum(windows.weight**2, axis=(1, 2)), 1))))
     chance = THRESHOLDS.push_beyond * rest * charge(len(sites) * len(first) * len(row))
     plain = gains > THRESHOLDS.push_share * (energy - np.median(energy))
+    # What moves outputs by less than 1.5 noise floors, from its beginning on, may be an integrator's.
+    begun = edges[first[np.stack(best, axis=-1)[row, most.argmax(axis=1)]]]
+    plain &= gains > THRESHOLDS.loud_channel**2 * (1 - begun / steps) * length
     for w, t in enumerate(windows.t.tolist()):
         forces = {}
         for i in np.argsort(-most[w], kind="stable").tolist():
