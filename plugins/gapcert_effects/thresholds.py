@@ -13,6 +13,7 @@ class Thresholds:
 
     min_turns: float = threshold(1.3, "periods over the range: measured on the Silverbox, fewer name a cubic spring")
     max_turns: float = chosen(20.0, "periods over the range of motion that are tried")
+    knots: int = chosen(7, "of a curve drawn through the data: three on either side of zero")
     push_starts: int = chosen(80, "tried: the width of a push grows with the length of the recording")
     latest_input: float = chosen(0.1, "of the duration of the data, that an input comes late at most")
     latest_periods: float = chosen(1000.0, "of delay, at most: each is a hidden state")
