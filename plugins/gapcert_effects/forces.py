@@ -13,7 +13,7 @@ from gapcert.plugin import Array, EffectParameter, Extension, Memory
 from gapcert_effects.thresholds import THRESHOLDS
 
 from .experiments import BOTH_WAYS, FREE_DECAY, LEVELS, PLACES, REVERSALS, SHAKE_AND_HOLD, SMALL_AND_LARGE, VARY_SPEED
-from .law import NEVER, Law, carries, driven, moves, neighbour, placed, spread, straight, tilts
+from .law import NEVER, Law, carries, driven, linked, moves, neighbour, placed, spread, straight, tilts
 
 
 @final
@@ -210,7 +210,8 @@ class Backlash(Law):
     equation = "F′ follows the applied F at a distance of at most width"
     memory = Memory("{width}_passed", "{force}", f"{{f}} + {_KEPT}")
     adds: ClassVar = {"force": _KEPT}
-    where = (driven,)
+    where = (linked,)
+    equivalent: ClassVar = {"input-hysteresis": "where one input is the force at one coordinate"}
     signature = "the response lags by a constant difference of the input, after every reversal anew, however slow it is"
     experiment = "reverse the input slowly and often, at small and at large amplitude, and hold it after each reversal"
     family = "play"

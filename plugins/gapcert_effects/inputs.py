@@ -1,10 +1,12 @@
-"""Faults on the way of an input, in the order of that way: delay, dead zone, rate, lag, supply, gain, offset, limit."""
+"""Faults on the way of an input, in the order of that way, from delay to limit."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
 from typing import ClassVar, final
+
+import numpy as np
 
 import gapcert as gc
 from gapcert.plugin import EffectParameter, Extension, Memory, site_units
@@ -79,11 +81,32 @@ class UnevenDeadZone(Law):
     family = "dead-zone"
     stage = 20
     contains: ClassVar = {"input-dead-zone": {"minus": "width", "plus": "width"}}
-    rivals: ClassVar = {"input-offset": SMALL_AND_LARGE, "backlash": REVERSALS}
+    rivals: ClassVar = {"input-offset": SMALL_AND_LARGE, "input-nonlinearity": LEVELS, "backlash": REVERSALS}
 
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         edges, sides = spread(0.05, 1.0, 5), ((1.0, 1.0), (1.0, 0.3), (0.3, 1.0), (1.0, 0.0), (0.0, 1.0))
         return [(a * w * scales["input"], b * w * scales["input"]) for w, (a, b) in itertools.product(edges, sides)]
+
+
+@final
+class BentDeadZone(Law):
+    """u acts as max(u − w₊, 0) + ratio·min(u + w₋, 0): beyond its edges a valve may open more in one direction."""
+
+    name = "input-dead-zone-bent"
+    variant_of = "input-dead-zone"
+    site = "input"
+    parameters = (_edge("minus"), _edge("plus"), EffectParameter("ratio", {}, (0.6, 1.6), 0.05, 20.0, off=1.0))
+    equation = "max(u − plus, 0) + ratio·min(u + minus, 0) acts"
+    adds: ClassVar = {"input": "max({u} - {plus}, 0) + {ratio}*min({u} + {minus}, 0)"}
+    signature = "small inputs do nothing, and larger ones act more strongly in one direction than in the other"
+    experiment = SMALL_AND_LARGE
+    family = "dead-zone"
+    stage = 20
+    contains: ClassVar = {"input-dead-zone": {"minus": "width", "plus": "width"}}
+    rivals: ClassVar = {"input-offset": SMALL_AND_LARGE, "input-nonlinearity": LEVELS, "backlash": REVERSALS}
+
+    def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
+        return [(*edges, ratio) for edges in UnevenDeadZone().grid(scales)[::2] for ratio in (0.6, 1.6)]
 
 
 @final
@@ -99,11 +122,123 @@ class InputDeadZone(Law):
     experiment = SMALL_AND_LARGE
     family = "dead-zone"
     stage = 20
-    variants = (UnevenDeadZone,)
+    variants = (UnevenDeadZone, BentDeadZone)
     rivals: ClassVar = {"coulomb-friction": FREE_DECAY, "input-gain": LEVELS, "backlash": REVERSALS}
 
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         return [(w * scales["input"],) for w in spread(0.02, 1.2, 9)]
+
+
+_STRAIGHT: Mapping[str, Mapping[str, str]] = {
+    name: {} for name in ("input-nonlinearity", "input-gain", "input-offset", "input-dead-zone", "input-saturation")
+}
+
+
+@final
+class InputCurve(Law):
+    """u acts as u + c(u), c straight between knots over the range of the data, and constant outside of it."""
+
+    name = "input-curve"
+    variant_of = "input-nonlinearity"
+    site = "input"
+    parameters = tuple(
+        EffectParameter(f"at_{k + 1}", {"input_peak": 1}, (0.03, 0.2), -3.0, 3.0) for k in range(THRESHOLDS.knots)
+    )
+    equation = f"u + c(u) acts, c straight between its values at {THRESHOLDS.knots} places"
+    signature = "every level of the input acts as its own one, at any speed and from either side"
+    experiment = LEVELS
+    family = "curve"
+    stage = 25
+    contains: ClassVar = _STRAIGHT
+    rivals: ClassVar = {"input-dead-zone": LEVELS, "input-saturation": LEVELS, "input-gain": LEVELS, "supply-sag": LEVELS}
+    reach = 1.0
+
+    def __init__(self) -> None:
+        self.knots = np.linspace(-1, 1, len(self.parameters))
+
+    def scaled(self, scales: Mapping[str, float]) -> InputCurve:
+        """Knots, as shares of the peak, as far apart on either side of zero, where both are used, and over the range."""
+        made, half = InputCurve(), len(self.knots) // 2
+        low, high, made.reach = (scales[f"input_{end}"] for end in ("low", "high", "peak"))
+        both = np.concatenate([np.linspace(low, 0, half, endpoint=False), np.linspace(0, high, half + 1)])
+        made.knots = np.round((both if low < 0 < high else np.linspace(low, high, len(self.knots))) / made.reach, 4)
+        return made
+
+    def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
+        """Curves that bend as valves and amplifiers do, on either side or on both."""
+        x = self.knots
+        bent = (x**2 - x, x**3 - x, np.sign(x) * np.sqrt(np.abs(x)) - x, -np.clip(x, -0.3, 0.3), np.clip(x, -0.5, 0.5) - x)
+        some = [part for c in bent for part in (c, c * (x > 0), c * (x < 0)) if np.any(part)]
+        return [tuple((0.5 * sign * scales["input_peak"] * c).tolist()) for c in some for sign in (1, -1)]
+
+    def extension(self, site: str, model: gc.Model) -> Extension:
+        """With the peak as a number of its own, in whose shares the knots x are told.
+
+        c = (c₁ + cₙ)/2 + Σ (sₖ − sₖ₋₁)/2·|u − xₖ| of the slopes s between knots, 0 beyond: each knot names u only once.
+        """
+        own, places = self.named(site, model), self.knots.tolist()
+        names = [p.name for p in own]
+        peak = gc.Parameter(f"{names[0].removesuffix(self.parameters[0].name)}peak", self.reach, own[0].unit)
+        gaps = zip(itertools.pairwise(names), itertools.pairwise(places), strict=True)
+        slopes = ["0", *(f"({d} - {c})/{round(y - x, 15)!r}" for (c, d), (x, y) in gaps), "0"]
+        bends = zip(itertools.pairwise(slopes), places, strict=True)
+        text = "".join(f" + ({after} - {before})*abs({{u}}/{peak.name} - {x!r})/2" for (before, after), x in bends)
+        return Extension(self.name, site, (*own, peak), input=f"{{u}} + ({names[0]} + {names[-1]})/2{text}")
+
+
+@final
+class InputNonlinearity(Law):
+    """u acts as u + a·u² + b·u³."""
+
+    name = "input-nonlinearity"
+    site = "input"
+    parameters = (
+        EffectParameter("square", {"input_peak": -1}, (0.03, 0.2), -3.0, 3.0),
+        EffectParameter("cube", {"input_peak": -2}, (0.03, 0.2), -3.0, 3.0),
+    )
+    equation = "u + square·u² + cube·u³ acts"
+    adds: ClassVar = {"input": "{u} + {square}*{u}**2 + {cube}*{u}**3"}
+    signature = "every level of the input acts as its own one, at any speed and from either side"
+    experiment = LEVELS
+    family = "curve"
+    stage = 25
+    variants = (InputCurve,)
+    rivals: ClassVar = {"input-dead-zone": LEVELS, "input-saturation": LEVELS, "input-gain": LEVELS, "supply-sag": LEVELS}
+
+    def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
+        one, two = (p.scale(scales) for p in self.parameters)
+        shapes = ((0.3, 0), (-0.3, 0), (0, 0.3), (0, -0.3), (0.2, 0.2), (0.2, -0.2), (-0.2, 0.2), (-0.2, -0.2))
+        return [(a * one, b * two) for a, b in shapes]
+
+
+_FOLLOWED = "{u} + min(max({memory} - {u}, -{width}), {width})"
+
+
+@final
+class InputHysteresis(Law):
+    """u acts as w, which follows once the two differ by r: w⁺ = clip(w, u ± r)."""
+
+    name = "input-hysteresis"
+    site = "input"
+    parameters = (EffectParameter("width", {"input_peak": 1}, (0.03, 0.2), 0.0, 1.0),)
+    equation = "w acts, which follows u at a distance of at most width"
+    memory = Memory("{width}_followed", "{input}", _FOLLOWED)
+    adds: ClassVar = {"input": _FOLLOWED}
+    signature = "a level acts otherwise when it is come to from above than from below, however slowly"
+    experiment = REVERSALS
+    family = "play"
+    stage = 30
+    equivalent: ClassVar = {"backlash": "where one input is the force at one coordinate"}
+    rivals: ClassVar = {
+        "input-dead-zone": REVERSALS,
+        "input-nonlinearity": REVERSALS,
+        "input-lag": FAST,
+        "input-delay": FAST,
+        "coulomb-friction": FREE_DECAY,
+    }
+
+    def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
+        return [(w * scales["input"],) for w in spread(0.02, 0.9, 9)]
 
 
 @final

@@ -71,6 +71,11 @@ def driven(site: str, model: gc.Model) -> bool:
     return bool({u.name for u in model.inputs} & _words(text))
 
 
+def linked(site: str, model: gc.Model) -> bool:
+    """Is there a force that reaches a coordinate of a mechanism?"""
+    return _mechanical(model) and driven(site, model)
+
+
 def placed(site: str, model: gc.Model) -> bool:
     """Has this coordinate (or the state whose equation this is) a position?"""
     if _mechanical(model):

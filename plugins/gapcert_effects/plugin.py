@@ -36,6 +36,8 @@ HOMES = {
         "input-offset": "an input that acts as if something were always added to it",
         "input-dead-zone": "an input that must exceed a threshold before it acts",
         "input-saturation": "an input that is cut off at a level",
+        "input-nonlinearity": "an input whose levels act by a curve instead of a straight line",
+        "input-hysteresis": "an input that is followed with play, from above otherwise than from below",
         "input-delay": "an input that acts late",
         "input-lag": "an input that acts through a first-order lag",
         "input-rate-limit": "an input that changes only so fast",

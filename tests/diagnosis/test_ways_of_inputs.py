@@ -98,6 +98,41 @@ def test_a_valve_opens_on_one_side_first():
     assert found == {"minus": pytest.approx(0.05, abs=0.01), "plus": pytest.approx(0.3, abs=0.01)}
 
 
+def test_a_valve_opens_wider_to_one_side():
+    acting = lambda u, h: np.maximum(u - 0.2, 0) + 0.6 * np.minimum(u + 0.05, 0)  # noqa: E731
+    found = only(told(VALVE, commands(1500, 25, 6), acting), "input-dead-zone")
+    assert (found["minus"], found["plus"]) == (pytest.approx(0.05, abs=0.01), pytest.approx(0.2, abs=0.01))
+    assert found["ratio"] == pytest.approx(0.6, rel=0.03)
+
+
+def test_an_amplifier_bends():
+    found = only(told(CART, 5 * commands(1500, 60, 7), lambda u, h: u + 0.02 * u**3), "input-nonlinearity")
+    assert found == {"square": pytest.approx(0.0, abs=0.003), "cube": pytest.approx(0.02, rel=0.05)}
+
+
+def test_any_curve_is_drawn_through_the_data():
+    levels, bent = np.linspace(-1, 1, 7), np.array([-0.9, -0.75, -0.15, 0.0, 0.4, 0.45, 1.1])
+    found = told(VALVE, commands(1500, 25, 8), lambda u, h: np.interp(u, levels, bent))
+    numbers = only(found, "input-nonlinearity")
+    assert list(numbers) == [f"at_{k}" for k in range(1, len(numbers) + 1)]
+    assert all(m.after < 1.5 * m.noise_floor for m in found.residual.values())
+
+
+def played(u, width):
+    out, w = np.empty_like(u), 0.0
+    for k, level in enumerate(u):
+        out[k] = w = min(max(w, level - width), level + width)
+    return out
+
+
+def test_play_of_an_input_is_hysteresis_and_of_the_only_force_as_well_backlash():
+    found = only(told(VALVE, commands(1500, 25, 9), lambda u, h: played(u, 0.12)), "input-hysteresis")
+    assert found == {"width": pytest.approx(0.12, rel=0.05)}
+    cart = told(CART, 5 * commands(1500, 60, 10), lambda u, h: played(u, 0.6))
+    assert only(cart, "backlash") == {"width": pytest.approx(0.6, rel=0.05)}
+    assert cart.ambiguous_with == ((("input-hysteresis", "f"),),)
+
+
 @pytest.mark.parametrize("hard", [True, False])
 def test_a_limit_is_one_cause_hard_or_soft(hard):
     found = told(CART, 5 * commands(1500, 60, 4), lambda u, h: np.clip(u, -2, 2) if hard else 2.4 * np.tanh(u / 2.4))

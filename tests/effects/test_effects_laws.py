@@ -166,12 +166,13 @@ def form(name, of="u", section=FREE, **numbers):
     effect = next(f for n in INPUTS for f in gc.registry().build("effect", n).variants if f.name == name)()
     model = equations(section)
     extension = effect.extension(of, model)
-    parameters = tuple(replace(p, value=numbers[e.name]) for p, e in zip(extension.parameters, effect.parameters, strict=True))
+    own = zip(extension.parameters, effect.parameters, strict=False)
+    parameters = tuple(replace(p, value=numbers[e.name]) for p, e in own) + extension.parameters[len(effect.parameters) :]
     extended = model.extend([replace(extension, parameters=parameters)])
     return np.diff(extended.fast_rollout(np.zeros((1, 1)), LEVELS[None, :, None]).x[0, :, 0]) / 0.01
 
 
-INPUTS = ("input-dead-zone", "input-saturation", "input-lag")
+INPUTS = ("input-dead-zone", "input-saturation", "input-lag", "input-nonlinearity")
 
 
 def test_soft_limits_bend_before_they_hold():
@@ -186,6 +187,26 @@ def test_a_dead_zone_may_lie_on_one_side_of_zero():
     for minus, plus in ((0.1, 0.5), (-0.1, 0.5), (0.6, 0.0)):
         found = form("input-dead-zone-uneven", minus=minus, plus=plus)
         np.testing.assert_allclose(found, LEVELS - np.clip(LEVELS, -minus, plus), atol=1e-12)
+        bent = np.maximum(LEVELS - plus, 0) + 0.7 * np.minimum(LEVELS + minus, 0)
+        np.testing.assert_allclose(form("input-dead-zone-bent", minus=minus, plus=plus, ratio=0.7), bent, atol=1e-12)
+
+
+def test_a_curve_is_straight_between_its_knots_and_constant_beyond():
+    numbers = dict(zip((f"at_{k}" for k in range(1, 8)), (0.3, -0.1, 0.2, 0.0, 0.1, -0.4, 0.5), strict=True))
+    found = form("input-curve", **numbers)
+    np.testing.assert_allclose(found, LEVELS + np.interp(LEVELS, np.linspace(-1, 1, 7), list(numbers.values())), atol=1e-12)
+    curve = gc.registry().build("effect", "input-nonlinearity").variants[0]()
+    for low, high, knots in ((-2.0, 4.0, [-0.5, -1 / 3, -1 / 6, 0, 1 / 3, 2 / 3, 1]), (1.0, 4.0, np.linspace(0.25, 1, 7))):
+        made = curve.scaled({"input_low": low, "input_high": high, "input_peak": max(-low, high)})
+        np.testing.assert_allclose(made.knots, knots, atol=1e-4)
+        assert made.reach == 4.0
+    bent = np.diff(driven(FREE, "input-nonlinearity", "u", LEVELS, square=0.3, cube=-0.2)[:, 0]) / 0.01
+    np.testing.assert_allclose(bent, LEVELS + 0.3 * LEVELS**2 - 0.2 * LEVELS**3, atol=1e-12)
+
+
+def test_hysteresis_of_the_only_force_is_play_of_that_force():
+    one, two = (driven(BLOCK, name, site, LEVELS, width=0.25) for name, site in (("input-hysteresis", "u"), ("backlash", "q")))
+    np.testing.assert_allclose(one, two, atol=1e-12)
 
 
 def test_a_second_lag_follows_the_first():
@@ -378,6 +399,7 @@ APPLIES = [
     ("wheel-slip", CART, {"q"}),
     ("wheel-slip", ROD, set()),
     ("backlash", {**PAIR, "forces": {"q": "u"}, "inputs": {"u": "N*m"}}, {"q"}),
+    ("backlash", PLAIN, set()),
     ("load-dependent-friction", {**PAIR, "forces": {"q": "u"}, "inputs": {"u": "N*m"}}, {"q"}),
     ("linear-spring", PLAIN, set()),
     ("cogging", {**PLAIN, "states": {"x": "m", "q": "m/s"}, "derivative": {"x": "q", "q": "u - k*q"}}, {"q"}),

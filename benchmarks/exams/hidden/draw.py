@@ -297,8 +297,26 @@ FAMILIES = (
         "load-dependent-friction",
     ),
     ("constant-force", "gravity-tilt", "input-offset", "sensor-bias"),
-    ("input-delay", "input-lag", "input-rate-limit", "input-rate-limited-lag", "sensor-delay", "backlash", "input-dead-zone"),
-    ("parameter", "input-gain", "payload", "sensor-scale", "supply-sag", "input-saturation", "wheel-slip"),
+    (
+        "input-delay",
+        "input-lag",
+        "input-rate-limit",
+        "input-rate-limited-lag",
+        "sensor-delay",
+        "backlash",
+        "input-dead-zone",
+        "input-hysteresis",
+    ),
+    (
+        "parameter",
+        "input-gain",
+        "payload",
+        "sensor-scale",
+        "supply-sag",
+        "input-saturation",
+        "wheel-slip",
+        "input-nonlinearity",
+    ),
     ("linear-spring", "cubic-spring", "cogging"),
 )
 MERGED = (*({i} for i in range(len(FAMILIES))), {1, 2})

@@ -231,9 +231,11 @@ _PUT: dict[str, Callable[[Tables, str, Numbers], None]] = {
     "sensor-delay": _into("sensor", delay=s.LATE),
     "sensor-quantisation": _quantum,
     "input-rate-limited-lag": _into("line", rate=s.LAG_RATE, time_constant=s.LAG),
+    "input-nonlinearity": _into("line", square=s.SQUARE, cube=s.CUBE),
+    "input-hysteresis": _into("line", width=s.FOLLOWED),
 }
 KNOWN = tuple(_PUT)
-LATER = ("input-rate-limited-lag",)  # one name more in turn would draw every exam anew
+LATER = ("input-rate-limited-lag", "input-nonlinearity", "input-hysteresis")  # more in turn would draw every exam anew
 NAMES = tuple(n for n in KNOWN if n not in LATER)
 KIND = {
     name: (
@@ -314,6 +316,8 @@ def shape(effect: str, z: Scales, rng: np.random.Generator, sign: float = 0.0) -
         "input-lag": Shape(lambda k: {"time_constant": k}, 0.4),
         "input-rate-limit": Shape(lambda k: {"rate": z.peak / k}, 0.8),
         "input-rate-limited-lag": Shape(lambda k: {"rate": z.peak / k, "time_constant": late * k}, 0.8),
+        "input-nonlinearity": Shape(lambda k: {"square": sign * share * k / z.peak, "cube": k / z.peak**2}, 1.0),
+        "input-hysteresis": Shape(lambda k: {"width": k * z.size}, 0.8),
         "supply-sag": Shape(lambda k: {"sag": k / z.peak, "time_constant": wait}, 0.8),
         "sensor-bias": Shape(lambda k: {"bias": sign * k * z.swing}, 1.0),
         "sensor-scale": Shape(lambda k: {"scale": 1 + k if sign > 0 else 1 / (1 + k)}, 0.5),

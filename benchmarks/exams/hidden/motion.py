@@ -56,12 +56,16 @@ class Drive(NamedTuple):
 
 @compiled
 def path(A: Array, i: int, memory: Array, value: float, step: float) -> float:
-    """One input after its faults, and its memories (rate-limited, lagging, drained) moved by one step.
+    """One input after its faults, and its memories (rate-limited, lagging, drained, followed) moved by one step.
 
     value: the command that has arrived.
     """
     if A[i, s.DEAD_ZONE] > 0:
         value = math.copysign(max(abs(value) - A[i, s.DEAD_ZONE], 0.0), value)
+    value += A[i, s.SQUARE] * value**2 + A[i, s.CUBE] * value**3
+    if A[i, s.FOLLOWED] > 0:
+        memory[i, 3] = min(max(memory[i, 3], value - A[i, s.FOLLOWED]), value + A[i, s.FOLLOWED])
+        value = memory[i, 3]
     if A[i, s.RATE] < np.inf:
         reach = A[i, s.RATE] * step
         memory[i, 0] += min(max(value - memory[i, 0], -reach), reach)
@@ -262,7 +266,7 @@ def simulate(machine: Machine, drive: Drive) -> tuple[Array, Array]:
     (T, nu), n = drive.u.shape, len(machine.C)
     x, y, ring = np.empty((T, 2 * n)), np.empty((T, 2 * n)), np.zeros((4096, 2 * n))
     W, M = np.zeros((s.WORKSPACE, n)), np.zeros((2, n, n))
-    memory, arrived, acting = np.zeros((nu, 3)), np.zeros(nu, dtype=np.int64), np.zeros(nu)
+    memory, arrived, acting = np.zeros((nu, 4)), np.zeros(nu, dtype=np.int64), np.zeros(nu)
     march(machine, drive, x, y, ring, W, M, memory, arrived, acting)
     return x, y
 

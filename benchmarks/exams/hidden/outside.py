@@ -26,7 +26,7 @@ class Outside:
         n = len(tables.sites)
         self.n, self.h = n, system.period
         self.rows = _rows(system, tables.sites)
-        self.W, self.memory = np.zeros((s.WORKSPACE, n)), np.zeros((len(tables.lines), 3))
+        self.W, self.memory = np.zeros((s.WORKSPACE, n)), np.zeros((len(tables.lines), 4))
         self.arrived = np.zeros(len(tables.lines), dtype=np.int64)
         idle = Tables(tables.sites, tables.lines, tables.sensors).coordinates
         idle[:, [s.TILT, s.PAYLOAD]] = tables.coordinates[:, [s.TILT, s.PAYLOAD]]

@@ -65,15 +65,20 @@ class Library:
         self._restatements: dict[Sequence[tuple[str, float]], Model] = {}
         self._path = np.concatenate(measured.states), np.concatenate(measured.inputs)
         effects = [v for e in effects for v in (e, *(form() for form in e.variants))]
-        every = [c for e in effects for s in model.sites(e.site) if self._possible(c := Candidate(e, s))]
+        every = [c for e in effects for s in model.sites(e.site) if self._possible(c := self._scaled(Candidate(e, s)))]
         self.aside = tuple(c for c in every if self._places(c) and not self.scales(c)["position_range"])
         every = [c for c in every if c not in self.aside]
         self.candidates = tuple(c for c in every if not _reads(c.effect))
         self.seen = tuple((c, found) for c in every if (found := self._read(c)) is not None)
         for c, found in self.seen:
             self.measured = self._roughened(c, found)
-        self._contains = {e.name: set(e.contains) for e in effects}
+        forms = {e.name: {f.name for f in e.variants} for e in effects}
+        near = {e.name: {n for n, same in e.contains.items() if not same and n != e.variant_of} for e in effects}
+        self._contains = {e.name: {*e.contains, *(f for n in near[e.name] for f in forms.get(n, ()))} for e in effects}
         self.moves = (*((c,) for c in self.candidates), *self._everywhere())
+
+    def _scaled(self, c: Candidate) -> Candidate:
+        return c if type(c.effect).scaled is Effect.scaled else Candidate(c.effect.scaled(self.scales(c)), c.site)
 
     def under(self, model: Model, effects: Sequence[Effect] = (), measured: Dataset | None = None) -> Library:
         """Of another model, or of other data."""
@@ -252,7 +257,8 @@ class Library:
         return tuple(p.unit for p in self._numbers(c))
 
     def _numbers(self, c: Candidate) -> Sequence[Parameter]:
-        return self.extension(c).parameters if (freed := self.freed(c)) is None else (freed,)
+        """Without the constants that an extension may have besides."""
+        return self.extension(c).parameters[: len(c.effect.parameters)] if (freed := self.freed(c)) is None else (freed,)
 
     def bounds(self, c: Candidate) -> tuple[Array, Array]:
         """(low, high) of a candidate's parameters, in their units."""
@@ -371,7 +377,8 @@ def _scales(library: Library, c: Candidate, x: Array, u: Array) -> dict[str, flo
     }
     kind = c.effect.site
     if kind == "input":
-        return times | _levels("input", u[:, [s.name for s in model.inputs].index(c.site)])
+        own = u[:, [s.name for s in model.inputs].index(c.site)]
+        return times | _levels("input", own) | {"input_low": float(own.min()), "input_high": float(own.max())}
     if kind == "output":
         y = np.concatenate(measured.outputs)[:, [s.name for s in measured.channels].index(c.site)]
         return times | _levels("output", y - np.nanmean(y))

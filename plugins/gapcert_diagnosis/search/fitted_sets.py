@@ -15,7 +15,7 @@ from gapcert_diagnosis.fitting.rollout_error import Stretches
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Candidate, Causes, Library
-from .criterion import Found, Keys, better, decides, halves, keys, named, noise, pays, rough_charge
+from .criterion import Found, Keys, better, decides, halves, keys, named, noise, pays, rough_charge, without
 from .gains import Promise
 from .screening import Screen, standing_in
 
@@ -190,6 +190,8 @@ class FittedSets:
     def carry(self, old: Candidate, new: Candidate, found: Found, default: bool = True) -> dict[str, float]:
         """First values of one law from those of another that it contains, or that contains it."""
         fitted = found[1].values
+        if old.effect.contains.get(new.told[0]) == {}:
+            return self._best_start(new, (*without(found[0], (old,)), new), found[1])
         mine, theirs = ({p.name: n for n, p in self.library.parameters(c).items()} for c in (new, old))
         out: dict[str, float] = self._first((new,), ((), self.nothing)) if default else {}
         for m, t in new.effect.contains.get(old.effect.name, {}).items():
@@ -197,6 +199,13 @@ class FittedSets:
         for t, m in old.effect.contains.get(new.effect.name, {}).items():
             out[mine[m]] = fitted[theirs[t]]
         return out
+
+    def _best_start(self, c: Candidate, causes: Causes, near: Fit) -> dict[str, float]:
+        """Of a law in the place of one that only comes near it: the best of its first values, beside the other causes."""
+        h, names = self.library.hypothesis(causes), self.library.names(c)
+        rows = [dict(zip(names, row, strict=True)) for row in self.library.starts(c).tolist()]
+        theta = promising(h, self.windows, np.array([h.theta(near.values | row) for row in rows]), near.start)[0]
+        return {n: float(theta[h.names.index(n)]) for n in names}
 
     def better(self, new: Fit, old: Fit) -> float:
         return better(new, old, self.cautious)

@@ -59,14 +59,15 @@ class EffectParameter:
 class Effect(ABC):
     """One physical cause, written as equations at a site. Subclasses set the attributes and implement `extension`.
 
-    name: kebab-case, a contract; site: the kind of site; sentence: what it is; equation: its law in one line; signature: how
-    data show it; rivals: name of a similar effect → the experiment that tells the two apart; experiment: what makes this
-    effect visible at all. amplitude: the parameter in which the effect is linear, None where there is none (a delay, a
-    limit); family: effects of one family look alike, and screening lets the best of each family through; contains: name of a
-    simpler effect → how its parameters become mine, {my parameter: its parameter} (mine that are not mentioned keep their
-    start); equivalent: name of an effect that is the same on some excitation → which; stage: the order along an input's
-    path, small ones nearer to the command; variants: other forms of the same cause, with numbers of their own, that are tried
-    beside it; variant_of: under whose name such a form is reported.
+    name: kebab-case, a contract; site: the kind of site; sentence: what it is; equation: its law in one line; signature:
+    how data show it; rivals: name of a similar effect → the experiment that tells the two apart; experiment: what makes
+    this effect visible at all. amplitude: the parameter in which the effect is linear, None where there is none (a delay, a
+    limit); family: effects of one family look alike, and screening lets the best of each family through; contains: name of
+    a simpler effect → how its parameters become mine, {my parameter: its parameter} (mine that are not mentioned keep their
+    start; {}: it comes near the simpler one in all its forms); equivalent: name of an effect that is the same on some
+    excitation → which; stage: the order along an input's path, small ones nearer to the command; variants: other forms of
+    the same cause, with numbers of their own, that are tried beside it; variant_of: under whose name such a form is
+    reported.
     """
 
     name: str
@@ -93,13 +94,18 @@ class Effect(ABC):
         """Values of all parameters, in their units, from which a search starts.
 
         scales: root mean squares of force, velocity, position, input and output at the site, their `…_peak`s, the
-        `position_range`, and in s the `period` of sampling and the `start` and `duration` of the data.
+        `position_range`, `input_low` and `input_high`, and in s the `period` of sampling and the `start` and `duration` of the
+        data.
         """
         return list(itertools.product(*([s * p.scale(scales) for s in p.starts] for p in self.parameters)))
 
     def suggested(self, place: Array, force: Array) -> list[tuple[float, ...]]:
         """More first values, in their units, that a force (n,) left over at places (n,) of a coordinate suggests."""
         return []
+
+    def scaled(self, scales: Mapping[str, float]) -> Effect:
+        """With what it takes from the data at a site, such as the knots of a curve; `scales` as for `grid`."""
+        return self
 
     def canonical(self, values: Mapping[str, float]) -> dict[str, float]:
         """The same effect in the numbers that a report shows, where several sets of numbers mean the same."""

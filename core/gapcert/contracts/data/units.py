@@ -44,9 +44,14 @@ def grouped(unit: str) -> str:
 def product(powers: Iterable[tuple[str, int]]) -> str:
     """The text of a product of powers of units; `1` for none."""
     given = [(unit, n) for unit, n in powers if unit != "1"]
-    over = [unit if n == 1 else f"{grouped(unit)}**{n}" for unit, n in given if n > 0]
-    under = ["/" + (grouped(unit) if n == -1 else f"{grouped(unit)}**{-n}") for unit, n in given if n < 0]
+    over = [unit if n == 1 else _power(unit, n) for unit, n in given if n > 0]
+    under = ["/" + (grouped(unit) if n == -1 else _power(unit, -n)) for unit, n in given if n < 0]
     return ("*".join(over) or "1") + "".join(under)
+
+
+def _power(unit: str, n: int) -> str:
+    """Of what ends in an exponent of its own, as factors: readers of units take no power of a power."""
+    return f"({'*'.join([grouped(unit)] * n)})" if unit[-1].isdigit() else f"{grouped(unit)}**{n}"
 
 
 def _convert(number: float, given: str, unit: str) -> float:
