@@ -328,10 +328,14 @@ def _timed(model: Model, recording: Recording, horizons: Sequence[float] | None)
 
 
 def _length(measured: Dataset, model: Model, window: float | None) -> int:
-    lengths = [len(y) - measured.history for y in measured.outputs]
+    lengths = sorted(len(y) - measured.history for y in measured.outputs)
+    # A few that are shorter than the others do not shorten all windows.
+    reached = np.cumsum(lengths) > THRESHOLDS.skipped_share * sum(lengths)
     usual = measured.samples(THRESHOLDS.window if len(model.coordinates) < 2 else THRESHOLDS.coupled_window)
     if window is None:
-        return max(THRESHOLDS.usual_samples, min(usual, sum(lengths) // THRESHOLDS.usual_windows, min(lengths)))
+        return max(
+            THRESHOLDS.usual_samples, min(usual, sum(lengths) // THRESHOLDS.usual_windows, lengths[int(np.argmax(reached))])
+        )
     if (own := measured.samples(window)) < THRESHOLDS.window_samples:
         raise UsageError(
             f"diagnose.window: {window:g} s hold {own} samples, {measured.period:g} s apart; expected "
