@@ -470,11 +470,13 @@ def _timed(model: Model, recording: Recording, horizons: Sequence[float] | None)
 
 def _length(measured: Dataset, model: Model, window: float | None, wanted: float | None = None) -> int:
     """In samples, as it is asked for, or `wanted` s (default: as usual) where the data are long enough for several such."""
-    lengths = [len(y) - measured.history for y in measured.outputs]
+    lengths = sorted(len(y) - measured.history for y in measured.outputs)
+    # A few that are shorter than the others do not shorten all windows.
+    most = lengths[int(np.argmax(np.cumsum(lengths) > THRESHOLDS.skipped_share * sum(lengths)))]
     usual = measured.samples(wanted or (THRESHOLDS.window if len(model.coordinates) < 2 else THRESHOLDS.coupled_window))
     if window is None:
         count = THRESHOLDS.guard_windows if wanted else THRESHOLDS.usual_windows
-        return max(THRESHOLDS.usual_samples, min(usual, sum(lengths) // count, min(lengths)))
+        return max(THRESHOLDS.usual_samples, min(usual, sum(lengths) // count, most))
     if (own := measured.samples(window)) < THRESHOLDS.window_samples:
         raise UsageError(
             f"diagnose.window: {window:g} s hold {own} samples, {measured.period:g} s apart; expected "

@@ -20,6 +20,7 @@ class Thresholds:
     longer_error: float = chosen(1.2, "of what noise makes of long rollouts, from which longer windows are tried")
     usual_samples: int = chosen(30, "in a window at least, before windows are made shorter to be more")
     usual_windows: int = chosen(8, "that a short recording is cut into: fewer cannot be resampled")
+    skipped_share: float = chosen(0.1, "of a recording, in stretches that may be too short for a window: more would be missed")
     input_sizes: tuple[float, ...] = chosen((1.0, 0.5, 0.25, 0.1), "of the limits, in turn until outputs stay within theirs")
     settled_fall: float = chosen(25.0, "expected fall in score that settles which rival is right: five standard errors")
     nested_separation: float = chosen(0.1, "of the larger one: below, one rival copies the other, and only charges differ")
@@ -39,6 +40,8 @@ class Thresholds:
     # data
     input_history: float = decides(0.1, "s of input before a window that effects with memory look back on")
     uneven_period: float = chosen(0.05, "of the period, between the median of uneven steps and the model's")
+    trembling: float = chosen(0.01, "of the period, by which half of all steps are off: such a clock is on no grid")
+    crowded_period: float = chosen(0.5, "of the model's period: a log with more samples is another one's")
     least_floor: float = chosen(1e-5, "of a channel's spread, as its noise: with less, exact data outweigh all others")
     window_samples: int = chosen(8, "at least: fewer are lost in a window's free start")
     seen_share: float = chosen(0.5, "of a window's values at least: with fewer, its start explains them")
@@ -98,6 +101,7 @@ class Thresholds:
         0.02, "noise floors that half the sub-steps may move a rollout by: 5,000 samples sum it up to 2 of Σ r²"
     )
     most_substeps: int = chosen(128, "times the stated ones: the time of a search grows with them")
+    stated_substeps: int = threshold(10_000, "at most, by the formula: more cannot be stated")
     probing_substeps: int = chosen(1000, "of a stated one, in which a rate is measured: an unstable step would not show it")
     fastest_mode: float = threshold(0.5, "rad, step times fastest rate: by the formula, rk4 errs by 1 in 3800 per step")
     tangent_nudge: float = chosen(1e-6, "of a state's size, for slopes of one step: between rounding and curvature")

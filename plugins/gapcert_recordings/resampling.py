@@ -30,7 +30,8 @@ class Log:
     gaps, resets, cuts: where a trajectory was cut, because time jumped ahead, was set back, or an input moved unseen;
     dropped: rows that are missing; duplicates: rows whose time does not go forward; outliers, missing: values per channel that
     count for nothing; repaired: input values replaced; jitter: rms of the times about an even grid, in s; stamps: `ignored`
-    where they were times of arrival of even samples; unused: s in stretches too short or too empty.
+    where they were times of arrival of even samples; unused: s in stretches too short or too empty; resampled: `from` and `to`
+    which period, in s, where samples are on another grid than their own.
     """
 
     gaps: list[dict[str, Any]] = field(default_factory=list)
@@ -44,6 +45,7 @@ class Log:
     jitter: float = 0.0
     stamps: str = "used"
     unused: float = 0.0
+    resampled: dict[str, float] = field(default_factory=dict)
 
     def count(self, kind: str, names: Sequence[str], flags: Bools) -> None:
         """Add the flags (T, k) of each channel to `outliers`, `missing` or `repaired`."""
@@ -390,6 +392,8 @@ def repairs(log: Mapping[str, Any]) -> Iterator[str]:
         yield f"{times(n, 'row')} whose time is missing or does not go forward {_are(n)} left out"
     if n := log.get("dropped"):
         yield f"{times(n, 'row')} {_are(n)} missing, and bridged"
+    if found := log.get("resampled"):
+        yield f"samples about {found['from']:.3g} s apart, unevenly, are put on a grid of {found['to']:.6g} s"
     if log.get("stamps") == "ignored":
         yield "times are taken for those of arrival, and replaced by even ones"
     for key, what in (("outliers", "far outside of everything around"), ("missing", "missing")):

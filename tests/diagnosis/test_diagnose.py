@@ -136,6 +136,53 @@ def test_a_short_second_log_takes_nothing_from_a_long_one():
     assert [(f.verdict, f.causes[0].effect) for f in found] == [("causes", "viscous-friction")] * 2
 
 
+def rod(damping, period):
+    """The swing with a damper in N·m·s that the model does not know, at a period in s."""
+    parameters = {**ROD["parameters"], "c": f"{damping} N*m*s/rad"}
+    bias = {"q": "m*g*l/2*sin(q) + c*q_dot"}
+    return equations({**ROD, "parameters": parameters, "bias": bias, "period": f"{period} s"})
+
+
+def runs(damping=0.0, count=24, few=()):
+    """As many logs, of which those in `few` end early, none of them long enough for two windows."""
+    u = np.stack([multisine(1.1, PERIOD, 2.0, (0.6, 4.0), 50 + k) for k in range(count)])
+    starts = np.array([[0.5 * (-1) ** k, 0.0] for k in range(count)])
+    q = rod(damping, PERIOD).fast_rollout(starts, u[:, :-1]).x[..., 0]
+    q += 1e-3 * np.random.default_rng(count).standard_normal(q.shape)
+    ends = [50 if k in few else q.shape[1] for k in range(count)]
+    logs = [gc.Recording.of(PERIOD * np.arange(e), {"q": q[k, :e], "u": u[k, :e, 0]}) for k, e in enumerate(ends)]
+    return gc.Recording(tuple(replace(log.trajectories[0], name=f"run {k}") for k, log in enumerate(logs)))
+
+
+@pytest.mark.parametrize("few", [(), (3, 11)])
+def test_many_runs_of_a_second_are_enough(few):
+    model, two = rod(0.0, PERIOD), ["viscous-friction", "coulomb-friction"]
+    assert [(c.effect, c.site) for c in gc.diagnose(model, runs(0.05, few=few), two).causes] == [("viscous-friction", "q")]
+    assert gc.diagnose(model, runs(few=few), two).verdict == "nothing"
+
+
+def trembling(damping, mean, seed=2):
+    """A swing that is logged at times of its own."""
+    u = np.repeat(multisine(12.0, 0.01, 2.0, (0.2, 2.5), 4), 20, axis=0)
+    q = rod(damping, 0.0005).fast_rollout(np.array([[0.3, 0.0]]), u[None, :-1]).x[0, :, 0]
+    rng = np.random.default_rng(seed)
+    gaps = mean * np.maximum(0.3, 1 + 0.2 * rng.standard_normal(int(11.5 / mean)))
+    rows = np.unique(np.round(np.cumsum(gaps) / 0.0005).astype(int))
+    rows = rows[rows < len(q)]
+    return gc.Recording.of(0.0005 * rows, {"q": q[rows] + 1e-3 * rng.standard_normal(len(rows)), "u": u[rows, 0]})
+
+
+@pytest.mark.parametrize("mean", [0.0087, 0.0128])
+def test_stamps_that_tremble_are_put_on_the_grid_of_the_model_and_told(mean):
+    told, log = [], trembling(0.05, mean)
+    two = ["viscous-friction", "coulomb-friction"]
+    found = find(rod(0.0, PERIOD), log, two, horizons=[0.5], emit=lambda e: told.append(str(e.data.get("message", ""))))
+    assert [(c.effect, c.site) for c in found.causes] == [("viscous-friction", "q")]
+    assert found.log["resampled"] == {"from": pytest.approx(mean, rel=0.05), "to": 0.01}
+    assert any("s apart, unevenly, are put on a grid of 0.01 s" in text for text in told)
+    assert find(rod(0.0, PERIOD), trembling(0.0, mean), two, horizons=[0.5]).verdict == "nothing"
+
+
 @pytest.mark.exam
 def test_ambiguous_when_the_speed_never_changes_until_the_experiment_is_played():
     cart, u = equations(CART), np.full((900, 1), 0.5)

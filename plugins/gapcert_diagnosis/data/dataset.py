@@ -60,6 +60,8 @@ class Dataset:
         recording = recording.converted({s.name: s.unit for s in (*channels, *model.inputs)})
         period, repeat = _period(model, recording)
         log, at = Log(), {c.name: i for i, c in enumerate(channels)}
+        if abs(recording.period - period) > THRESHOLDS.uneven_period * period:
+            log.resampled = {"from": recording.period, "to": period}
         named = {model.states[i].name: model.states[j].name for i, j in _driven(model)}
         rates = {at[a]: at[b] for a, b in named.items() if a in at and b in at}
         found = [
@@ -94,7 +96,8 @@ class Dataset:
             {h: tuple(p.means(repeat, h) for p in kept) for h in _HOLDS},
             tuple(i for i, _ in found),
             recording.hold,
-            {"samples": int(sizes.sum()), "period": period, "hold": recording.hold or "undeclared", **vars(log)},
+            {"samples": int(sizes.sum()), "period": period, "hold": recording.hold or "undeclared"}
+            | {k: v for k, v in vars(log).items() if v or k != "resampled"},
         )
 
     @property
@@ -288,11 +291,17 @@ class Windows:
         return np.stack([m.driven[i][s * m.repeat - m.past : s * m.repeat + after] for i, s in self.place.tolist()])
 
     def guard(self, share: float = 0.25) -> tuple[Windows, Windows]:
-        """(earlier, later): the last quarter of every trajectory's windows, in time order, judges what the rest suggests."""
+        """(earlier, later): the last quarter of every trajectory's windows, in time order, judges what the rest suggests; or
+        the last quarter of the trajectories, where they are too short for that.
+        """
         late = np.zeros(len(self), dtype=bool)
         for i in np.unique(self.trajectory):
             rows = np.flatnonzero(self.trajectory == i)
             late[rows[len(rows) - round(share * len(rows)) :]] = True
+        if late.mean() < share / 2 and len(np.unique(self.trajectory)) >= THRESHOLDS.guard_windows:
+            # Runs that are a window or two each are judged by the last of them.
+            last = np.unique(self.trajectory)[-max(1, round(share * len(np.unique(self.trajectory)))) :]
+            late = np.isin(self.trajectory, last)
         if late.all() or not late.any():
             raise UsageError(
                 f"recording: {len(self)} windows are too few to fit on some and check on others; record for longer"
@@ -333,6 +342,11 @@ def _period(model: Model, recording: Recording) -> tuple[float, int]:
     even = all(np.abs(np.diff(tr.t) / period - 1).max() <= JITTER for tr in recording.trajectories)
     if repeat >= 1 and not even and off <= THRESHOLDS.uneven_period * period:
         return repeat * model.period, repeat
+    # Stamps that tremble are on no grid of their own: that of the model does as well.
+    apart = np.concatenate([np.diff(tr.t) for tr in recording.trajectories])
+    trembling = np.median(np.abs(apart / period - 1)) > THRESHOLDS.trembling
+    if recording.every is None and trembling and period > THRESHOLDS.crowded_period * model.period:
+        return (repeat or 1) * model.period, repeat or 1
     steps = max(1, math.ceil(period / model.period - JITTER))
     raise UsageError(
         f"recording: samples are {period:.6g} s apart, the model steps by {model.period:.6g} s; expected a whole number of "

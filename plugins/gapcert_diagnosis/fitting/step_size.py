@@ -58,14 +58,15 @@ def settled(model: Model, windows: Windows) -> tuple[Model, tuple[str, ...]]:
     explicit integrator is not for it.
     """
     m, part, own = windows.measured, windows.take(_few(windows)), model.substeps
-    finer = None if m.exact else stepped(model, THRESHOLDS.probing_substeps * own)
+    finer = None if m.exact else stepped(model, own, model.period / THRESHOLDS.probing_substeps)
     # Of its own step a rate can show as nothing: a map that turns its mode over once has an eigenvalue of one.
     rate = 0.0 if finer is None else THRESHOLDS.probing_substeps * fastest(finer, part.start, part.u[:, m.history])
     if not THRESHOLDS.fastest_mode <= rate < np.inf:
         return model, ()
     first = y = _rolled(model, part)
     now, moved = model, np.inf
-    while moved > THRESHOLDS.still_rollout and (n := 2 * now.substeps) <= THRESHOLDS.most_substeps * own:
+    most = min(THRESHOLDS.most_substeps * own, THRESHOLDS.stated_substeps)
+    while moved > THRESHOLDS.still_rollout and (n := 2 * now.substeps) <= most:
         if (fine := stepped(model, n)) is None:
             return model, ()
         before, y = y, _rolled(fine, part)
@@ -74,7 +75,7 @@ def settled(model: Model, windows: Windows) -> tuple[Model, tuple[str, ...]]:
         now = fine if moved > THRESHOLDS.still_rollout else now
     time = model.period / own / rate
     if not np.isfinite(y).all() and rate > THRESHOLDS.most_substeps:
-        need, most = f"{m.period / time:.2g}", THRESHOLDS.most_substeps * m.repeat
+        need, most = f"{m.period / time:.2g}", most * m.repeat
         raise UsageError(
             f"model: its fastest mode has a time constant of {time:.2g} s, and samples are {m.period:.6g} s apart; an explicit "
             f"integrator would need {need} sub-steps between two; expected {most} at most; put the value that the fast state "
