@@ -228,7 +228,9 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
 
     answer = answered(settled.search, settled.found, windows)
     pushed = spared("list of pushes", (), _pushes, problem, data, answer)
-    calm = data.calm(problem, pushed) if len(pushed) > sum(c.effect.name == PUSH for c in answer.causes) else None
+    more = len(pushed) > sum(c.effect.name == PUSH for c in answer.causes)
+    loud = bool((np.sqrt(answer.fit.chi) > THRESHOLDS.loud_channel).any())
+    calm = data.calm(problem, pushed) if more and loud else None
     if calm is not None:
         data, plain, whole = calm, answer.nothing, stretches(data.held, problem.horizons, answer.fit)[-1]
         settled, windows = _settled(data, replace(problem, effects=[e for e in problem.effects if e.name != PUSH]))

@@ -197,6 +197,8 @@ class Thresholds:
     push_overlap: int = chosen(4, "windows that see a push: at the edge of one it hides in the free start")
     push_share: float = chosen(0.8, "of a window's residual, beyond the usual one, that a push must explain")
     push_beyond: float = chosen(1.5, "times what chance finds: a floor is known to a fifth, and an integrator is no noise")
+    jump: float = chosen(0.5, "of an input's deviation from one sample to the next: a jump")
+    by_command: float = chosen(0.01, "chance that so many pushes begin after jumps of an input by accident")
     push_gap: float = chosen(1.5, "times the same, from which numbers are fitted again without the windows that stand out")
     push_rare: float = chosen(6.0, "times what any window without pushes holds, where these are more than noise")
     push_calm: float = chosen(0.5, "of all windows at least that hold no push: what comes so often is a law")

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
+from scipy.stats import binom
 
 from gapcert.plugin import Effect, Model, position, site_units
 from gapcert_diagnosis.data.dataset import Dataset
@@ -70,12 +71,34 @@ def pushes(
         free = np.array([all(t > f.stretch[1] or t + span < f.stretch[0] for f in found) for t in w.t.tolist()])
         if free.sum() >= THRESHOLDS.guard_windows:
             last = fit(last.hypothesis, w.take(free), theta=last.theta, start=last.start[free])
+    if _commanded(found, measured):
+        return ()
     about = _About(extended(last.values), last, measured, law, found)
     told = [about.fits(f) for f in sorted(found, key=lambda f: (f.piece, f.stretch))]
     left = {s: sum(float(np.sum(fits[s].residual ** 2)) for fits in told if s in fits) for s in about.model.sites("coordinate")}
     usual = sorted(left, key=lambda s: (position(about.model, s) is None, left[s]))
     listed = (about.push(fits, usual, names) for fits in told)
     return tuple(p for p in listed if p is not None)
+
+
+def _commanded(found: Sequence[_Found], measured: Dataset) -> bool:
+    """Do they come after jumps of an input more often than chance has it? Then a law makes them."""
+    size = np.std(np.concatenate(measured.inputs), axis=0)
+    after = []
+    for u in measured.inputs:
+        jumps = (
+            np.r_[False, np.any(np.abs(np.diff(u, axis=0)) > THRESHOLDS.jump * size, axis=1)]
+            if size.size
+            else np.zeros(len(u), bool)
+        )
+        near = np.convolve(jumps, np.ones(measured.samples(THRESHOLDS.short_window) + 1))[: len(u)] > 0
+        after.append(near)
+    share = float(np.mean(np.concatenate(after)))
+    begun = [
+        after[f.piece][np.clip(np.searchsorted(measured.times[f.piece], f.stretch[0]), 0, len(after[f.piece]) - 1)]
+        for f in found
+    ]
+    return bool(binom.sf(sum(begun) - 1, len(begun), share) < THRESHOLDS.by_command)
 
 
 def _standing_out(found: Sequence[_Found], sure: bool) -> list[_Found]:
@@ -129,7 +152,7 @@ def _strongest(model: Model, last: Fit, measured: Dataset, length: int) -> Itera
     plain = gains > THRESHOLDS.push_share * (energy - np.median(energy))
     # What moves outputs by less than 1.5 noise floors, from its beginning on, may be an integrator's.
     begun = edges[first[np.stack(best, axis=-1)[row, most.argmax(axis=1)]]]
-    plain &= gains > THRESHOLDS.loud_channel**2 * (1 - begun / steps) * length
+    plain &= gains > THRESHOLDS.loud_channel**2 * rest * (1 - begun / steps) * length
     for w, t in enumerate(windows.t.tolist()):
         forces = {}
         for i in np.argsort(-most[w], kind="stable").tolist():
