@@ -27,7 +27,7 @@ from .fitting.rollout_error import Stretches, stretches
 from .fitting.step_size import coarse
 from .residual import unexplained as leftover
 from .results import Cause, Diagnosis, Estimate, Misfit, Rival
-from .search.alternatives import Answer, answered, flags, smallest
+from .search.alternatives import Answer, answered, flags, smallest, unit_slip
 from .search.candidates import Candidate, Library
 from .search.criterion import without
 from .search.engine_settings import Setting, across
@@ -351,7 +351,8 @@ def _named(answer: Answer, c: Candidate, judge: Stretches) -> Cause:
         )
     share = _share(judge.error(last), before)
     native = library.model.native(*c.told)
-    return Cause(*c.told, _numbers(library, c, last), share, runner_up, native, flags(library, c, last))
+    slip = unit_slip(library, c, last)
+    return Cause(*c.told, _numbers(library, c, last), share, runner_up, native, flags(library, c, last), unit_slip=slip)
 
 
 def _set(answer: Answer, s: Setting, judge: Stretches) -> Cause:

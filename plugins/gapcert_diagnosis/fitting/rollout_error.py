@@ -62,7 +62,8 @@ class Stretches:
         """Mean squared error (W, ny) of every rollout and channel."""
         error = difference(self.windows.measured.channels, self.simulate(fitted), self.windows.y[:, self.lead :])
         seen = self.windows.weight[:, self.lead :]
-        return np.asarray(np.sum(seen * error**2, axis=1) / np.maximum(np.sum(seen, axis=1), 1))
+        with np.errstate(over="ignore"):
+            return np.asarray(np.sum(seen * error**2, axis=1) / np.maximum(np.sum(seen, axis=1), 1))
 
     def error(self, fitted: Fit) -> float:
         """E: root mean square over all channels, each divided by its standard deviation in the data."""
