@@ -30,7 +30,7 @@ from .residual import unexplained as leftover
 from .residual.adequacy import blind, close
 from .residual.pushes import pushes
 from .results import Cause, Diagnosis, Estimate, Misfit, Push, Rival
-from .search.alternatives import Answer, answered, decided, flags
+from .search.alternatives import Answer, answered, decided, flags, unit_slip
 from .search.candidates import Candidate, Library
 from .search.criterion import noise, without
 from .search.engine_settings import Setting, Settled, across
@@ -500,7 +500,8 @@ def _named(answer: Answer, c: Candidate, judge: Stretches) -> Cause:
         )
     share = _share(judge.error(last), before)
     native = library.model.native(*c.told)
-    return Cause(*c.told, _numbers(library, c, last), share, runner_up, native, flags(library, c, last))
+    slip = unit_slip(library, c, last)
+    return Cause(*c.told, _numbers(library, c, last), share, runner_up, native, flags(library, c, last), unit_slip=slip)
 
 
 def _set(answer: Answer, s: Setting, judge: Stretches) -> Cause:

@@ -61,7 +61,7 @@ class Cause:
     """An effect that was named: parameters with intervals and the share of the held-out rollout error that it explains.
 
     explained = 1 − E_after/E_before with all other named causes kept. native: the engine's own name; flags: sentences about
-    values that are not plausible; setting: `value` and `was` of an engine's setting.
+    values that are not plausible; setting: `value` and `was` of an engine's setting; unit_slip: units that a factor confuses.
     """
 
     effect: str
@@ -72,6 +72,7 @@ class Cause:
     native: str | None = None
     flags: tuple[str, ...] = ()
     setting: Mapping[str, Any] | None = None
+    unit_slip: str | None = None
 
 
 @final
@@ -274,6 +275,7 @@ def _cause(cause: Cause) -> dict[str, Any]:
     out: dict[str, Any] = {"effect": cause.effect, "site": cause.site}
     out |= {} if cause.native is None else {"native": cause.native}
     out |= {} if cause.setting is None else {"setting": dict(cause.setting)}
+    out |= {} if cause.unit_slip is None else {"unit_slip": cause.unit_slip}
     out["parameters"] = {n: vars(p).copy() for n, p in cause.parameters.items()}
     out["explained"] = cause.explained
     if cause.runner_up is not None:

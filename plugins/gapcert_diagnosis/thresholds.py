@@ -1,5 +1,6 @@
 """Numbers that decide or bound what is tried, accepted or refused in this room, each with its reason."""
 
+import math
 from dataclasses import dataclass
 from typing import final
 
@@ -186,7 +187,7 @@ class Thresholds:
     shown_alone: float = chosen(2.0, "times what forces predict of it, that a residual is of one channel's own")
     loud_channel: float = threshold(1.5, "noise floors: by rule, a channel above it is not at its noise")
     start_draws: int = chosen(8, "of noise, from which it is known to some percent how far it leads a rollout astray")
-    close_motion: float = threshold(0.08, "of the motion's deviation: measured, linear_drive leaves 0.038, a stand-in 0.18")
+    close_motion: float = threshold(0.06, "of the motion's deviation: measured, linear_drive leaves 0.038, stand-ins 0.08 and 0.18")
     located_floor: float = chosen(1.05, "mean square in noise floors from which a missing force is located")
     slight_force: float = chosen(0.005, "share of the effort that integrators may leave")
     faint_force: float = threshold(0.003, "share of the effort: measured, MuJoCo's implicit integrator leaves so much at 1 ms")
@@ -219,6 +220,12 @@ class Thresholds:
     far_rival: float = chosen(30.0, "score: rivals that are worse by it on the earlier data are not fitted again")
     likely_relative: float = chosen(0.3, "of the best promise, from which a relative of a cause is fitted")
     even_score: float = chosen(4.0, "by which one of equally simple sets is plainly the best")
+    unit_slips: tuple[tuple[str, float], ...] = chosen(
+        (("deg/rad", math.pi / 180), ("rpm/(rad/s)", 60 / math.tau), ("1000", 1000.0), ("g", 9.80665)),
+        "factors, and their inverses, of units that logs confuse",
+    )
+    near_slip: float = chosen(0.01, "of such a factor: two of them are 2.7 % apart")
+    sure_slip: float = chosen(0.002, "the same, where the interval is narrower than what the model's own numbers are worth")
     at_bound: float = chosen(1e-6, "of the width of a number's bounds: what ends closer is told to be at one")
     swept_points: int = chosen(1000, "of a range, in which a law's size is looked for")
     nuisance_reach: float = decides(3.0, "tolerances that a stated parameter may be off before that is itself a cause")

@@ -391,7 +391,7 @@ class InputGain(Law):
 
     name = "input-gain"
     site = "input"
-    parameters = (EffectParameter("gain", {}, (0.8, 1.25), -5.0, 5.0, off=1.0, plausible=(0.3, 3.0)),)
+    parameters = (EffectParameter("gain", {}, (0.8, 1.25), -2e3, 2e3, off=1.0, plausible=(0.3, 3.0)),)
     equation = "gain·u acts"
     adds: ClassVar = {"input": "{gain}*{u}"}
     signature = "the response to every input level is wrong by the same factor"

@@ -40,7 +40,7 @@ class SensorScale(Law):
 
     name = "sensor-scale"
     site = "output"
-    parameters = (EffectParameter("scale", {}, (0.9, 1.1), -5.0, 5.0, off=1.0, plausible=(0.5, 2.0)),)
+    parameters = (EffectParameter("scale", {}, (0.9, 1.1), -2e3, 2e3, off=1.0, plausible=(0.5, 2.0)),)
     equation = "scale·y is seen"
     adds: ClassVar = {"output": "{scale}*{y}"}
     signature = "free swings have the right frequency for another amplitude"

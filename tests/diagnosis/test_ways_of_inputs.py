@@ -56,7 +56,7 @@ def lagged(u, seconds, h):
     return out
 
 
-def told(plant, u, way, seed=0, noise=0.004):
+def told(plant, u, way, shown=1.0):
     """The diagnosis of a plant which the input u (T,) reaches by way(fine input, fine step)."""
     section, slope, rest = plant
     model = equations({"kind": "equations", "integrator": "rk4", **section})
@@ -67,8 +67,8 @@ def told(plant, u, way, seed=0, noise=0.004):
         path.append(x[0])
         for level in levels:
             x = x + h * slope(x + h / 2 * slope(x, level), level)
-    y = np.array(path)
-    y = y + noise * np.std(y) * np.random.default_rng(seed).standard_normal(len(y))
+    y = shown * np.array(path)
+    y = y + 0.004 * np.std(y) * np.random.default_rng(0).standard_normal(len(y))
     names = model.outputs[0].name, model.inputs[0].name
     recording = gc.Recording.of(np.arange(len(u)) * model.period, dict(zip(names, (y, u), strict=True)), hold="zero")
     return diagnose(model, recording)
@@ -143,3 +143,23 @@ def test_a_limit_is_one_cause_hard_or_soft(hard):
 def test_nothing_is_found_where_the_input_arrives_as_it_was_sent():
     for plant, low in ((OVEN, 0.0), (VALVE, -1.0), (CART, -1.0)):
         assert told(plant, 5 * commands(1200, 40, 5, low), lambda u, h: u).verdict == "nothing"
+
+
+@pytest.mark.parametrize(
+    ("factor", "units"), [(180 / np.pi, "deg/rad"), (0.001, "1000"), (9.80665, "g"), (2.3, None), (0.1, None)]
+)
+def test_a_gain_may_be_a_slip_of_units(factor, units):
+    found = told(CART, 5 * commands(1200, 60, 11), lambda u, h: factor * u)
+    (cause,) = found.causes
+    assert cause.effect == "input-gain"
+    assert cause.parameters["gain"].value == pytest.approx(factor, rel=0.01)
+    assert found.summary()["causes"][0].get("unit_slip") == units
+    assert [f for f in cause.flags if "slip of units" in f] == [f for f in cause.flags if units]
+    assert any("implausible" in f for f in cause.flags) == (factor == 0.1)
+
+
+def test_a_sensor_may_show_millimetres():
+    """Where the motion is linear, that is the same as an input which acts a thousand times as much."""
+    (cause,) = told(CART, 5 * commands(1200, 60, 12), lambda u, h: u, 1000.0).causes
+    assert cause.effect in ("sensor-scale", "input-gain")
+    assert cause.unit_slip == "1000"

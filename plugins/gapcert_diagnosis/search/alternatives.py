@@ -193,6 +193,8 @@ def _implausible(library: Library, c: Candidate, fitted: Fit) -> dict[str, tuple
     stated = None if (freed := library.freed(c)) is None else freed.value
     if stated == 0:
         return {}
+    if unit_slip(library, c, fitted) is not None:
+        return {}
     known, scales = fitted.values, library.scales(c)
     limits = {n: (p.plausible[0] * p.scale(scales), p.plausible[1] * p.scale(scales)) for n, p in library.parameters(c).items()}
     if stated is not None and stated < 0:
@@ -200,9 +202,24 @@ def _implausible(library: Library, c: Candidate, fitted: Fit) -> dict[str, tuple
     return {n: ends for n, ends in limits.items() if not ends[0] <= known[n] <= ends[1]}
 
 
+def unit_slip(library: Library, c: Candidate, fitted: Fit) -> str | None:
+    """The two units that a factor of an input or an output confuses, where it is what one of them is of the other."""
+    if not library.is_factor(c):
+        return None
+    value, half = fitted.estimates()[library.names(c)[0]]
+    for units, factor in THRESHOLDS.unit_slips:
+        for slip in (factor, 1 / factor):
+            off = abs(abs(value) - slip) / slip
+            if off < THRESHOLDS.near_slip and off * slip < max(half, THRESHOLDS.sure_slip * slip):
+                return units
+    return None
+
+
 def flags(library: Library, c: Candidate, fitted: Fit) -> tuple[str, ...]:
     """Sentences about numbers that are not plausible, or that lie at the edge of what was tried."""
-    known, out = fitted.values, []
+    known, out = fitted.values, list[str]()
+    if (units := unit_slip(library, c, fitted)) is not None:
+        out.append(f"a slip of units: {c.site} differs by the factor of {units}; is it in the log in the unit of the model?")
     low, high = library.bounds(c)
     implausible = _implausible(library, c, fitted)
     for i, ((name, p), off) in enumerate(zip(library.parameters(c).items(), library.off(c), strict=True)):

@@ -245,6 +245,11 @@ class Library:
             return 0
         return None if c.effect.amplitude is None else [p.name for p in c.effect.parameters].index(c.effect.amplitude)
 
+    def is_factor(self, c: Candidate) -> bool:
+        """Is it one factor of an input or an output, 1 where it does nothing?"""
+        numbers = c.effect.parameters
+        return c.effect.site in ("input", "output") and len(numbers) == 1 and not numbers[0].dimension and numbers[0].off == 1.0
+
     def names(self, c: Candidate) -> tuple[str, ...]:
         """What a candidate's parameters are called in the extended model."""
         return tuple(p.name for p in self._numbers(c))
