@@ -26,7 +26,7 @@ from .fitting.fit import Fit, fit, followed
 from .fitting.rollout_error import Stretches, stretches
 from .fitting.step_size import coarse
 from .residual import unexplained as leftover
-from .residual.pushes import pushes
+from .residual.pushes import elsewhere, pushes
 from .results import Cause, Diagnosis, Estimate, Misfit, Push, Rival
 from .search.alternatives import Answer, answered, flags, smallest
 from .search.candidates import Candidate, Library
@@ -192,7 +192,11 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
 
     answer = answered(settled.search, settled.found, data.windows)
     pushed = spared("list of pushes", (), _pushes, problem, data, answer)
-    calm = data.calm(problem, pushed) if len(pushed) > sum(c.effect.name == PUSH for c in answer.causes) else None
+    calm = (
+        spared("search between pushes", None, data.calm, problem, pushed)
+        if len(pushed) > sum(c.effect.name == PUSH for c in answer.causes)
+        else None
+    )
     if calm is not None:
         data, plain, whole = calm, answer.nothing, stretches(data.held, problem.horizons, answer.fit)[-1]
         settled = across(data.library, [e for e in problem.effects if e.name != PUSH], data.windows, problem.clock.tell)
@@ -267,9 +271,11 @@ class _Data:
     assumptions: tuple[str, ...]
 
     def calm(self, problem: DiagnosisProblem, pushed: Sequence[Push]) -> _Data | None:
-        """Between pushes, where these are an effect that may be named, and enough is left between them."""
-        effects = [e for e in problem.effects if e.name != PUSH]
+        """Between pushes, where these are an effect that may be named, no law of a place, and enough is left between them."""
+        effects, names = [e for e in problem.effects if e.name != PUSH], [tr.name for tr in problem.recording.trajectories]
         if not pushed or len(effects) == len(problem.effects):
+            return None
+        if not elsewhere(problem.model, Dataset.of(problem.model, problem.recording), names, pushed):
             return None
         fitted = self.windows.measured.between(_at(pushed, problem.fitted))
         held = self.held.between(_at(pushed, problem.held_out)) or self.held
@@ -314,7 +320,14 @@ def _at(pushed: Sequence[Push], recording: Recording) -> list[tuple[int, float, 
 
 
 def _pushes(problem: DiagnosisProblem, data: _Data, answer: Answer) -> tuple[Push, ...]:
-    """All along the recording, where more than noise is left without them."""
+    """All along the recording, where more than noise is left without them; none where too little is whole to look in."""
+    try:
+        return _listed(problem, data, answer)
+    except UsageError:
+        return ()
+
+
+def _listed(problem: DiagnosisProblem, data: _Data, answer: Answer) -> tuple[Push, ...]:
     named = tuple(c for c in answer.causes if c.effect.name == PUSH)
     causes = without(answer.causes, named)
     last = answer.search.fit(causes, (answer.causes, answer.fit)) if named else answer.fit
@@ -327,6 +340,12 @@ def _pushes(problem: DiagnosisProblem, data: _Data, answer: Answer) -> tuple[Pus
     whole = replace(whole, sigma=held.sigma, spread=held.spread, hold=answer.dataset.hold)
     names = [tr.name for tr in problem.recording.trajectories]
     law = registry().build("effect", PUSH)
+    if causes:
+        # Causes may stand in for pushes: where these leave noise without them, they are the answer.
+        found = pushes(lambda values: data.library.extended((), values), answer.search.nothing, whole, names, law)
+        between = data.windows.measured.between(_at(found, problem.fitted)) if found else None
+        if between is not None and noise(fit(data.library.hypothesis(()), between.windows(data.windows.length))):
+            return found
     return pushes(lambda values: data.library.extended(causes, values), last, whole, names, law)
 
 

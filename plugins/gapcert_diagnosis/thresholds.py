@@ -169,6 +169,7 @@ class Thresholds:
     push_rare: float = chosen(6.0, "times what any window without pushes holds, where these are more than noise")
     push_calm: float = chosen(0.5, "of all windows at least that hold no push: what comes so often is a law")
     push_repeated: float = chosen(0.8, "of the residual that may be left by repetitions of a command, to take them off")
+    push_rest: float = chosen(0.005, "of the rest of the data at either end of the range that it knows")
     push_sure: float = chosen(0.5, "of a push's impulse that its 95 % interval may be to either side")
     same_way: float = chosen(0.1, "of a state's standard deviation, by which repetitions may begin apart and be compared")
     same_command: float = chosen(1e-3, "of an input's standard deviation, by which a repeated one may differ")

@@ -78,6 +78,22 @@ def pushes(
     return tuple(p for p in listed if p is not None)
 
 
+def elsewhere(model: Model, measured: Dataset, names: Sequence[str], pushed: Sequence[Push]) -> bool:
+    """Do most of them come at places and inputs that the rest of the recording knows? Else they may be a law, as of a stop."""
+    places = {position(model, site) for site in model.sites("coordinate")}
+    shown = [i for i, s in enumerate(model.states) if s.name in places]
+    rows = [np.hstack([x[:, shown], u]) for x, u in zip(measured.states, measured.inputs, strict=True)]
+    during = [
+        [(names[k] == p.trajectory) & (t >= p.t) & (t <= p.t + p.duration) for p in pushed]
+        for t, k in zip(measured.times, measured.source, strict=True)
+    ]
+    calm = np.concatenate([z[~np.any(hit, axis=0)] for z, hit in zip(rows, during, strict=True)])
+    low, high = np.quantile(calm, [THRESHOLDS.push_rest, 1 - THRESHOLDS.push_rest], axis=0)
+    at = [np.concatenate([z[hit[k]] for z, hit in zip(rows, during, strict=True)]) for k in range(len(pushed))]
+    known = [bool(((np.median(z, axis=0) >= low) & (np.median(z, axis=0) <= high)).all()) for z in at if len(z)]
+    return 2 * sum(known) > len(known)
+
+
 def _standing_out(found: Sequence[_Found], sure: bool) -> list[_Found]:
     """Of the strongest forces in all windows those that stand out from what the windows hold that see none of them.
 
