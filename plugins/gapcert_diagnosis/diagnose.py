@@ -28,7 +28,7 @@ from .fitting.rollout_error import Stretches, stretches
 from .fitting.step_size import coarse, settled
 from .residual import unexplained as leftover
 from .residual.adequacy import blind, close
-from .residual.pushes import pushes
+from .residual.pushes import elsewhere, pushes
 from .results import Cause, Diagnosis, Estimate, Misfit, Push, Rival
 from .search.alternatives import Answer, answered, decided, flags, unit_slip
 from .search.candidates import Candidate, Library
@@ -230,7 +230,7 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
     pushed = spared("list of pushes", (), _pushes, problem, data, answer)
     more = len(pushed) > sum(c.effect.name == PUSH for c in answer.causes)
     loud = bool((np.sqrt(answer.fit.chi) > THRESHOLDS.loud_channel).any())
-    calm = data.calm(problem, pushed) if more and loud else None
+    calm = spared("search between pushes", None, data.calm, problem, pushed) if more and loud else None
     if calm is not None:
         data, plain, whole = calm, answer.nothing, stretches(data.held, problem.horizons, answer.fit)[-1]
         settled, windows = _settled(data, replace(problem, effects=[e for e in problem.effects if e.name != PUSH]))
@@ -328,9 +328,11 @@ class Data:
     assumptions: tuple[str, ...]
 
     def calm(self, problem: DiagnosisProblem, pushed: Sequence[Push]) -> Data | None:
-        """Between pushes, where these are an effect that may be named, and enough is left between them."""
-        effects = [e for e in problem.effects if e.name != PUSH]
+        """Between pushes, where these are an effect that may be named, no law of a place, and enough is left between them."""
+        effects, names = [e for e in problem.effects if e.name != PUSH], [tr.name for tr in problem.recording.trajectories]
         if not pushed or len(effects) == len(problem.effects):
+            return None
+        if not elsewhere(problem.model, Dataset.of(problem.model, problem.recording), names, pushed):
             return None
         fitted = self.windows.measured.between(_at(pushed, problem.fitted))
         held = self.held.between(_at(pushed, problem.held_out)) or self.held
@@ -379,7 +381,14 @@ def _at(pushed: Sequence[Push], recording: Recording) -> list[tuple[int, float, 
 
 
 def _pushes(problem: DiagnosisProblem, data: Data, answer: Answer) -> tuple[Push, ...]:
-    """All along the recording, where more than noise is left without them."""
+    """All along the recording, where more than noise is left without them; none where too little is whole to look in."""
+    try:
+        return _listed(problem, data, answer)
+    except UsageError:
+        return ()
+
+
+def _listed(problem: DiagnosisProblem, data: Data, answer: Answer) -> tuple[Push, ...]:
     named = tuple(c for c in answer.causes if c.effect.name == PUSH)
     causes = without(answer.causes, named)
     last = answer.search.fit(causes, (answer.causes, answer.fit)) if named else answer.fit
@@ -392,6 +401,12 @@ def _pushes(problem: DiagnosisProblem, data: Data, answer: Answer) -> tuple[Push
     whole = replace(whole, sigma=held.sigma, spread=held.spread, hold=answer.dataset.hold)
     names = [tr.name for tr in problem.recording.trajectories]
     law = registry().build("effect", PUSH)
+    if causes:
+        # Causes may stand in for pushes: where these leave noise without them, they are the answer.
+        found = pushes(lambda values: data.library.extended((), values), answer.search.nothing, whole, names, law)
+        between = data.windows.measured.between(_at(found, problem.fitted)) if found else None
+        if between is not None and noise(fit(data.library.hypothesis(()), between.windows(data.windows.length))):
+            return found
     return pushes(lambda values: data.library.extended(causes, values), last, whole, names, law)
 
 

@@ -187,7 +187,9 @@ class Thresholds:
     shown_alone: float = chosen(2.0, "times what forces predict of it, that a residual is of one channel's own")
     loud_channel: float = threshold(1.5, "noise floors: by rule, a channel above it is not at its noise")
     start_draws: int = chosen(8, "of noise, from which it is known to some percent how far it leads a rollout astray")
-    close_motion: float = threshold(0.06, "of the motion's deviation: measured, linear_drive leaves 0.038, stand-ins 0.08 and 0.18")
+    close_motion: float = threshold(
+        0.06, "of the motion's deviation: measured, linear_drive leaves 0.038, stand-ins 0.08 and 0.18"
+    )
     located_floor: float = chosen(1.05, "mean square in noise floors from which a missing force is located")
     slight_force: float = chosen(0.005, "share of the effort that integrators may leave")
     faint_force: float = threshold(0.003, "share of the effort: measured, MuJoCo's implicit integrator leaves so much at 1 ms")
@@ -204,6 +206,7 @@ class Thresholds:
     push_rare: float = chosen(6.0, "times what any window without pushes holds, where these are more than noise")
     push_calm: float = chosen(0.5, "of all windows at least that hold no push: what comes so often is a law")
     push_repeated: float = chosen(0.8, "of the residual that may be left by repetitions of a command, to take them off")
+    push_rest: float = chosen(0.005, "of the rest of the data at either end of the range that it knows")
     push_sure: float = chosen(0.5, "of a push's impulse that its 95 % interval may be to either side")
     same_way: float = chosen(0.1, "of a state's standard deviation, by which repetitions may begin apart and be compared")
     same_command: float = chosen(1e-3, "of an input's standard deviation, by which a repeated one may differ")

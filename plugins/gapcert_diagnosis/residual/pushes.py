@@ -16,7 +16,7 @@ from typing import final
 import numpy as np
 from scipy.stats import binom
 
-from gapcert.plugin import Effect, Model, position, site_units
+from gapcert.plugin import Bools, Effect, Model, position, site_units
 from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.fitting.fit import Fit, fit, followed, rescued
 from gapcert_diagnosis.fitting.hypothesis import Hypothesis
@@ -83,22 +83,31 @@ def pushes(
 
 def _commanded(found: Sequence[_Found], measured: Dataset) -> bool:
     """Do they come after jumps of an input more often than chance has it? Then a law makes them."""
-    size = np.std(np.concatenate(measured.inputs), axis=0)
-    after = []
+    size, after = np.std(np.concatenate(measured.inputs), axis=0), list[Bools]()
     for u in measured.inputs:
-        jumps = (
-            np.r_[False, np.any(np.abs(np.diff(u, axis=0)) > THRESHOLDS.jump * size, axis=1)]
-            if size.size
-            else np.zeros(len(u), bool)
-        )
-        near = np.convolve(jumps, np.ones(measured.samples(THRESHOLDS.short_window) + 1))[: len(u)] > 0
-        after.append(near)
+        jumps = np.any(np.abs(np.diff(u, axis=0, prepend=u[:1])) > THRESHOLDS.jump * size, axis=1)
+        after.append(np.convolve(jumps, np.ones(measured.samples(THRESHOLDS.short_window) + 1))[: len(u)] > 0)
     share = float(np.mean(np.concatenate(after)))
     begun = [
-        after[f.piece][np.clip(np.searchsorted(measured.times[f.piece], f.stretch[0]), 0, len(after[f.piece]) - 1)]
-        for f in found
+        after[f.piece][min(np.searchsorted(measured.times[f.piece], f.stretch[0]), len(after[f.piece]) - 1)] for f in found
     ]
     return bool(binom.sf(sum(begun) - 1, len(begun), share) < THRESHOLDS.by_command)
+
+
+def elsewhere(model: Model, measured: Dataset, names: Sequence[str], pushed: Sequence[Push]) -> bool:
+    """Do most of them come at places and inputs that the rest of the recording knows? Else they may be a law, as of a stop."""
+    places = {position(model, site) for site in model.sites("coordinate")}
+    shown = [i for i, s in enumerate(model.states) if s.name in places]
+    rows = [np.hstack([x[:, shown], u]) for x, u in zip(measured.states, measured.inputs, strict=True)]
+    during = [
+        [(names[k] == p.trajectory) & (t >= p.t) & (t <= p.t + p.duration) for p in pushed]
+        for t, k in zip(measured.times, measured.source, strict=True)
+    ]
+    calm = np.concatenate([z[~np.any(hit, axis=0)] for z, hit in zip(rows, during, strict=True)])
+    low, high = np.quantile(calm, [THRESHOLDS.push_rest, 1 - THRESHOLDS.push_rest], axis=0)
+    at = [np.concatenate([z[hit[k]] for z, hit in zip(rows, during, strict=True)]) for k in range(len(pushed))]
+    known = [bool(((np.median(z, axis=0) >= low) & (np.median(z, axis=0) <= high)).all()) for z in at if len(z)]
+    return 2 * sum(known) > len(known)
 
 
 def _standing_out(found: Sequence[_Found], sure: bool) -> list[_Found]:
