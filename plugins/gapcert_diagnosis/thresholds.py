@@ -233,6 +233,7 @@ class Thresholds:
     swept_points: int = chosen(1000, "of a range, in which a law's size is looked for")
     nuisance_reach: float = decides(3.0, "tolerances that a stated parameter may be off before that is itself a cause")
     tolerance_sigmas: float = threshold(2.0, "as usual: a tolerance is a 95 % interval")
+    needles: int = chosen(4, "of one law, from which a fit begins while more than noise is left")
     needle_step: float = chosen(1 / 6, "of the least distance between values that are suggested, as a difference step at most")
     difference_step: float = decides(0.1, "of the smallest start: steps must see over the kinks of dry laws")
     nuisance_step: float = decides(0.1, "of a tolerance, for differences")

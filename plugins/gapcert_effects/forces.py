@@ -177,7 +177,7 @@ class Cogging(Law):
             found.append(float(turns[np.argmax(agreed)]))
             agreed[np.abs(turns - found[-1]) < 2.0] = 0.0
         size, reach = float(np.sqrt(2.0) * np.std(force)), float(np.ptp(place))
-        return [(size, reach / (n + d), phase) for n in found for d in (-0.25, 0.0, 0.25) for phase in _PHASES]
+        return [(size, reach / (n + d), phase) for n in found for d in _BESIDE for phase in _PHASES]
 
     def canonical(self, values: Mapping[str, float]) -> dict[str, float]:
         """A positive amplitude, and a phase within half a turn."""
@@ -187,6 +187,7 @@ class Cogging(Law):
 
 
 _PHASES = (0.0, 0.5 * math.pi)
+_BESIDE = (-1.0, -0.25, 0.0, 0.25, 1.0)  # periods over the range: side lobes are one apart
 
 
 def _periodogram(place: Array, force: Array) -> tuple[Array, Array, Array]:

@@ -216,3 +216,20 @@ def test_with_noise_most_settings_cost_one_step_and_no_fit(tmp_path, monkeypatch
     found = gc.diagnose(model, gc.Recording.of(tr.t, noisy, hold="zero"), FRICTION, horizons=[0.5])
     assert [(c.effect, c.site) for c in found.causes] == [("viscous-friction", "q")]
     assert len({id(m) for m in fits}) <= settings.THRESHOLDS.setting_contenders + 2 < len(model.variants())
+
+
+@pytest.mark.exam
+def test_a_step_that_is_late_is_no_delay_of_the_input(tmp_path):
+    """Half of a step of 10 ms beyond half of one of 2.5 ms is 3.75 ms; and less damping than the file's is no negative one."""
+    reality = backend(tmp_path, name="real", damping=0.05, dry=0.06, period="10 ms", substeps=4)
+    log = gc.play(reality, {"u": (-1.5, 1.5), "q": (-0.5, 0.5)}, seconds=16.0, trajectories=1, seed=2)
+    (tr,) = log.trajectories
+    noise = 5e-4 * np.random.default_rng(3).standard_normal(len(tr.t))
+    log = replace(gc.Recording.of(tr.t, {"q": tr.channels["q"] + noise, "u": tr.channels["u"]}), hold="zero")
+    model = gapcert_engines.EngineModel(backend(tmp_path, damping=0.09, period="10 ms"))
+    found = gc.diagnose(model, log, ["viscous-friction", "coulomb-friction", "input-delay", "sensor-delay"], horizons=[0.5])
+    causes = {c.effect: c for c in found.causes}
+    assert set(causes) == {"engine-setting", "viscous-friction", "coulomb-friction"}
+    assert (causes["engine-setting"].site, causes["engine-setting"].setting["value"]) == ("substeps", 4)
+    assert causes["viscous-friction"].parameters["coefficient"].value == pytest.approx(-0.04, rel=0.1)
+    assert not any(f.startswith("implausible") for f in causes["viscous-friction"].flags)

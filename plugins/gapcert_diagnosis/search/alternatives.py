@@ -8,10 +8,12 @@ from typing import final
 
 import numpy as np
 
+from gapcert.plugin import Model
 from gapcert_diagnosis.data.dataset import Dataset, Windows
 from gapcert_diagnosis.fitting.fit import Fit
 from gapcert_diagnosis.fitting.rollout_error import Stretches
 from gapcert_diagnosis.thresholds import THRESHOLDS
+from gapcert_engines import EngineModel
 
 from .candidates import Candidate, Causes, Library
 from .criterion import Found, ahead, fails, keys, rank, richer, without
@@ -199,7 +201,16 @@ def _implausible(library: Library, c: Candidate, fitted: Fit) -> dict[str, tuple
     limits = {n: (p.plausible[0] * p.scale(scales), p.plausible[1] * p.scale(scales)) for n, p in library.parameters(c).items()}
     if stated is not None and stated < 0:
         limits = {n: (-high, -low) for n, (low, high) in limits.items()}
-    return {n: ends for n, ends in limits.items() if not ends[0] <= known[n] <= ends[1]}
+    own = _own(library.model, c)
+    return {n: ends for n, ends in limits.items() if not ends[0] <= known[n] + own <= ends[1]}
+
+
+def _own(model: Model, c: Candidate) -> float:
+    """What an engine has already of the number that a cause adds to: less friction than it has is no negative one."""
+    added = len(c.effect.parameters) == 1 and c.effect.parameters[0].off == 0
+    native = model.native(*c.key) if added and isinstance(model, EngineModel) else None
+    numbers = {p.name: p.value for p in model.backend.parameters} if isinstance(model, EngineModel) and native else {}
+    return float(numbers.get(native or "", 0.0))
 
 
 def unit_slip(library: Library, c: Candidate, fitted: Fit) -> str | None:

@@ -13,10 +13,10 @@ import numpy as np
 
 from gapcert.plugin import Effect, Model, UsageError, Variant
 from gapcert_diagnosis.data.dataset import Windows, once
-from gapcert_diagnosis.fitting.fit import Fit, fit, stepped
+from gapcert_diagnosis.fitting.fit import Fit, fit, followed, stepped
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
-from .candidates import Causes, Library
+from .candidates import Candidate, Causes, Library
 from .criterion import Found, better, noise, setting_pays, without
 from .fitted_sets import FittedSets
 from .moves import additions
@@ -136,12 +136,35 @@ class _Settings:
         for g in [without(causes, (c,)) for c in causes] if len(causes) > 1 else []:
             gone = 0.0 if exact else float(np.sum(self.fitted(self.library.model, g, self.few, start).residual ** 2))
             own = gone - float(np.sum(whole.residual**2))
+            (late,) = without(causes, g)
+            if not exact and self.within_step(late, start):
+                out.append([t for t in self.as_found([v for v, _ in felt], g, start) if _near(t[2], whole)])
+                continue
             alike = [v for v, moved in felt if exact or THRESHOLDS.like_cause * own < moved < own / THRESHOLDS.like_cause]
             out.append(self.rank(alike, g, start, None if exact else whole))
         if causes and now.chi.max() >= THRESHOLDS.quiet and not noise(now, THRESHOLDS.sure_errors):
             some = [v for v, moved in felt if exact or moved > THRESHOLDS.least_fall * size or moved < THRESHOLDS.still * size]
             out.append(self.rank(some, causes, start))
         return out
+
+    def within_step(self, c: Candidate, known: Numbers) -> bool:
+        """Is all that a cause does a shift in time, of no more than the step of the engine? Then that may be what is late."""
+        step = self.library.model.period / self.library.model.substeps
+        times = [n for n, p in self.library.parameters(c).items() if set(p.dimension) in ({"time"}, {"period"})]
+        return c.effect.amplitude is None and len(times) == len(c.effect.parameters) and all(known[n] <= step for n in times)
+
+    def as_found(self, variants: Sequence[Variant], causes: Causes, known: Numbers) -> list[Tried]:
+        """Fits under the settings that leave least with numbers as they are known, best first.
+
+        What a step shifts in time is many noise floors: from a fit without it no step leads to these numbers.
+        """
+        left = list[tuple[float, int]]()
+        for i, v in enumerate(variants):
+            h = self.bare(v.model).hypothesis(causes)
+            with contextlib.suppress(UsageError):
+                left.append((float(followed(h, h.theta(known), self.few).chi.sum()), i))
+        few = [variants[i] for _, i in sorted(left)[: THRESHOLDS.setting_finalists]]
+        return _best([t for v in few if (t := self.fit_under(v, causes, known))])
 
     def rank(
         self, variants: Sequence[Variant], causes: Causes, start: Numbers | None = None, rival: Fit | None = None

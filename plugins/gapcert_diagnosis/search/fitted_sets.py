@@ -117,18 +117,23 @@ class FittedSets:
         for factor in THRESHOLDS.shakes if dry and not noise(best) else ():
             shaken = {n: v * factor if n in dry else v for n, v in best.values.items()}
             self.fit_again(causes, None, shaken)
-        for c in causes if not noise(best) else ():
-            if (start := self._elsewhere(c, best)) is not None:
-                self.fit_again(causes, None, start)
+        for c in causes:
+            tried = [best.values]
+            while (
+                not noise(best) and len(tried) < THRESHOLDS.needles and (start := self._elsewhere(c, best, tried)) is not None
+            ):
+                tried.append(start)
+                best = self.fit_again(causes, None, start)
         return self._fits[keys(causes)][1]
 
-    def _elsewhere(self, c: Candidate, best: Fit) -> dict[str, float] | None:
-        """The numbers of a fit with the most promising of those that data suggest for a cause, away from its own: each is a
-        needle, and beside it are others.
+    def _elsewhere(self, c: Candidate, best: Fit, tried: Sequence[Mapping[str, float]]) -> dict[str, float] | None:
+        """The numbers of a fit with the most promising of those that data suggest for a cause, away from all that were tried:
+        each is a needle, and beside it are others.
         """
         names, h, known = self.library.names(c), best.hypothesis, best.values
         rows = [dict(zip(names, row, strict=True)) for row in self.library.suggested(c)]
-        rows = [r for r in rows if any(abs(r[n] - known[n]) > 12 * h.step[h.names.index(n)] for n in self.library.needles(c))]
+        apart = {n: 12 * h.step[h.names.index(n)] for n in self.library.needles(c)}
+        rows = [r for r in rows if all(any(abs(r[n] - t[n]) > d for n, d in apart.items()) for t in tried)]
         if not rows:
             return None
         turned = [r | {n: sign * r[n] for n in [names[self.library.amplitude(c) or 0]]} for r in rows for sign in (1, -1)]
