@@ -110,7 +110,7 @@ def unexcited(model: Model, m: Dataset) -> Iterator[str]:
         if high - low <= THRESHOLDS.still * max(abs(low), abs(high)):
             yield f"{s.name} never changes: what acts on it looks like an offset, or cannot be seen at all"
         elif low >= 0 or high <= 0:
-            yield f"{s.name} never changes its sign: a dead zone, and what differs between its signs, cannot be seen"
+            yield f"{s.name} never changes its sign: what differs between its signs cannot be seen"
     states = {s.name: x[:, i] for i, s in enumerate(model.states) if s.size == 1}
     moved = {c.name: spread / sigma for c, spread, sigma in zip(m.channels, m.spread, m.sigma, strict=True)}
     for q in model.sites("coordinate"):

@@ -198,8 +198,8 @@ class Experiment:
 class Seen:
     """The smallest size of an effect that these data would show: the value of one of its parameters.
 
-    share: of the effort at its site, of the spread of an output, or of a stated value, where it does most. off: the value at
-    which the effect does nothing, where that is neither zero nor beyond all bounds.
+    share: of the effort at its site, of the spread of an output, or of a stated value, where it does most; None where there is
+    next to no effort. off: the value at which the effect does nothing, where that is neither zero nor beyond all bounds.
     """
 
     effect: str
@@ -207,7 +207,7 @@ class Seen:
     parameter: str
     value: float
     unit: str
-    share: float = float("nan")
+    share: float | None = None
     off: float | None = None
 
 

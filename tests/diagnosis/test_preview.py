@@ -15,6 +15,7 @@ from gapcert_diagnosis.preview import preview
 from gapcert_diagnosis.section import DiagnoseConfig
 from gapcert_diagnosis.testing import equations
 from gapcert_recordings.flaws import flaws
+from gapcert_report.words.preview import in_words
 
 PERIOD = 0.005
 SLED = {
@@ -98,6 +99,10 @@ def test_sizes_are_those_of_the_noise_whatever_is_hidden(swept):
 
 
 def test_an_input_that_never_changes():
+    still = looked(np.zeros(2400))
+    assert [s.share for s in still.seen if s.effect == "input-offset"] == [None]
+    assert {("input-gain", "F"), ("input-delay", "F")} <= set(still.unseen)
+    assert any("at F, what would be seen only if" in line for line in in_words(still.summary()))
     found = looked(np.full(2400, 1.5))
     assert any(s.startswith("F never changes:") for s in found.unexcited)
     model, one_way = equations(SLED | {"bias": {}, "parameters": {"M": "1.4 kg"}}), np.abs(PUSHED).reshape(-1, 1)

@@ -62,7 +62,9 @@ class Visible:
                 value = 2 * off - value if low[k] <= 2 * off - value <= high[k] and value < off else value
                 told = off if 0 < abs(off) <= max(abs(low[k]), abs(high[k])) else None
                 unit = self.library.units(c)[k]
-                out.append(Seen(*c.key, c.effect.parameters[k].name, value, unit, self.share(c, found), told))
+                share = self.share(c, found)
+                beside = share if share < THRESHOLDS.no_effort else None
+                out.append(Seen(*c.key, c.effect.parameters[k].name, value, unit, beside, told))
         return tuple(out)
 
     def least(self, c: Candidate) -> Array | None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from gapcert_figures import called
 from gapcert_report.pictures.svg import FAINT, WITH, Picture, draw
 from gapcert_report.words.diagnosis import least_size
-from gapcert_report.words.preview import of_what, sentences
+from gapcert_report.words.preview import beside, of_what, sentences
 from gapcert_report.words.words import Summary
 
 from .html import Html, folded, gallery, h, table
@@ -26,10 +26,11 @@ def could_show(found: Summary) -> Iterator[Html | None]:
     if told := found.get("instead"):
         yield h("p", f"{told[:1].upper()}{told[1:]}.")
         return
-    seen = sorted(found["seen"], key=lambda s: (s["site"], s["share"]))
+    seen = sorted(found["seen"], key=lambda s: (s["site"], beside(s)))
     rows = [(called(s["effect"], s["site"]), s["parameter"].replace("_", " "), least_size(s), of_what(s)) for s in seen]
     head = ("effect", "parameter", "would be seen from", "share")
-    yield gallery([_sizes(i, seen[i : i + MOST_BARS]) for i in range(0, len(seen), MOST_BARS)])
+    drawn = [s for s in seen if s["share"] is not None]
+    yield gallery([_sizes(i, drawn[i : i + MOST_BARS]) for i in range(0, len(drawn), MOST_BARS)])
     yield folded(f"All {len(rows)}", table("The smallest size of each effect that would be seen", head, rows, 2))
     yield h("ul", *(h("li", f"{text[:1].upper()}{text[1:]}.") for text in sentences(found)))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator, Sequence
 
 from gapcert.plugin import columns
@@ -15,8 +16,13 @@ MOST_ROWS = 100  # on a terminal, before each effect has one row for all of its 
 
 
 def of_what(entry: Summary) -> str:
-    """`1.2 % of the effort`: how large a size is beside what is there."""
-    return f"{100 * entry['share']:.2g} %"
+    """`1.2 %`: how large a size is beside what is there; `–` where there is nothing."""
+    return "–" if entry["share"] is None else f"{100 * entry['share']:.2g} %"
+
+
+def beside(entry: Summary) -> float:
+    """The share as a number, infinite where there is nothing."""
+    return math.inf if entry["share"] is None else float(entry["share"])
 
 
 def in_words(found: Summary) -> list[str]:
@@ -42,7 +48,7 @@ def _row(entry: Summary, site: str, text: str) -> tuple[str, ...]:
 def _together(seen: Sequence[Summary]) -> Iterator[tuple[str, ...]]:
     """One row for an effect at all of its sites."""
     for _, group in itertools.groupby(sorted(seen, key=lambda s: s["effect"]), key=lambda s: s["effect"]):
-        some = sorted(group, key=lambda s: s["share"])
+        some = sorted(group, key=beside)
         least, most = some[0], some[-1]
         if least is most:
             yield _row(least, least["site"], least_size(least))
@@ -59,7 +65,7 @@ def sentences(found: Summary) -> list[str]:
         share = 100 * c["noise_floor"] / c["deviation"]
         out.append(f"{floor}, {share:.2g} % of its deviation; before any search the model leaves {c['left']:.3g} noise floors")
     out += found["unexcited"]
-    faint = [s for s in found["seen"] if s["share"] > 1 and s["effect"] != "parameter"]
+    faint = [s for s in found["seen"] if beside(s) > 1 and s["effect"] != "parameter"]
     for head, some in (
         ("no size that is searched would be seen of", found["unseen"]),
         ("what would be seen only if it were more than all that acts there is", faint),
