@@ -87,10 +87,8 @@ def _commanded(found: Sequence[_Found], measured: Dataset) -> bool:
     for u in measured.inputs:
         jumps = np.any(np.abs(np.diff(u, axis=0, prepend=u[:1])) > THRESHOLDS.jump * size, axis=1)
         after.append(np.convolve(jumps, np.ones(measured.samples(THRESHOLDS.short_window) + 1))[: len(u)] > 0)
-    share = float(np.mean(np.concatenate(after)))
-    begun = [
-        after[f.piece][min(np.searchsorted(measured.times[f.piece], f.stretch[0]), len(after[f.piece]) - 1)] for f in found
-    ]
+    starts = [(after[f.piece], int(np.searchsorted(measured.times[f.piece], f.stretch[0]))) for f in found]
+    begun, share = [bool(near[min(k, len(near) - 1)]) for near, k in starts], float(np.mean(np.concatenate(after)))
     return bool(binom.sf(sum(begun) - 1, len(begun), share) < THRESHOLDS.by_command)
 
 
