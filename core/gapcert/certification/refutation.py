@@ -275,10 +275,10 @@ def growth_warning(bound: LipschitzBound, axes: Sequence[StateSpec]) -> str | No
     noise = [s for s in sweep if (s["state"], s["axis"], s["kind"]) == (state.name, axis.name, "noise")]
     if noise:
         return _sweep_warning(noise, axes)
-    (s0, s1), (d0, d1) = found["slopes"], found["distances"]
+    (s0, s1), (d0, d1), at = found["slopes"], found["distances"], dict(zip((a.name for a in axes), found["where"], strict=True))
     return (
         f"The slope of {state.name} along {axis.name} grew from {s0:.3g} to {s1:.3g} as the distance shrank from {d0:.2g} to "
-        f"{d1:.2g}{_unit(axis)} at {_at(found['where'], axes)}: f̂ − f seems to jump there, by "
+        f"{d1:.2g}{_unit(axis)} at {_named(at)}: f̂ − f seems to jump there, by "
         f"{found['size']:.3g}{_unit(state)}, and no constant bounds a jump; {ADVICE}."
     )
 
@@ -336,19 +336,16 @@ def jump_sentence(bound: LipschitzBound, axes: Sequence[StateSpec], but: str = "
     )
 
 
-def _but(problem: GapProblem) -> str:
-    return "" if problem.symmetry is None else problem.symmetry.exception
-
-
 def curvature_sentences(problem: GapProblem, gap: GapFunction) -> list[str]:
     """What a gap function assumes of curvature."""
     h = problem.lipschitz.curvature
     if not on_curvature(gap.form) or h is None:
         return []
+    but = "" if problem.symmetry is None else problem.symmetry.exception
     origin = {
         "estimated": "estimated",
         "declared": "declared and taken on trust",
-        "interval": f"proved by interval arithmetic from the equations of both systems{_but(problem)}",
+        "interval": f"proved by interval arithmetic from the equations of both systems{but}",
     }.get(problem.lipschitz.provenance, problem.lipschitz.provenance)
     bare = [s.name for s, row in zip(problem.domain.axes, h, strict=False) if np.isinf(row).any()]
     known = problem.lipschitz.provenance == "interval"  # then kinks have no curvature
@@ -366,7 +363,3 @@ def _unit(axis: StateSpec) -> str:
 
 def _named(where: dict[str, float]) -> str:
     return "(" + ", ".join(f"{name} = {value:.4g}" for name, value in where.items()) + ")"
-
-
-def _at(where: Sequence[float], axes: Sequence[StateSpec]) -> str:
-    return _named(dict(zip((a.name for a in axes), where, strict=True)))

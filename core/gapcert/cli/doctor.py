@@ -34,7 +34,7 @@ def examine() -> dict[str, Any]:
         "python": platform.python_version(),
         "platform": platform.platform(),
         "processors": os.cpu_count(),
-        "memory_gib": _memory(),
+        "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
         "chromium": browser or _playwright() or "not found: reports are written, only their browser test needs one",
         "vulkan": drivers[0]
         if drivers
@@ -58,10 +58,6 @@ def pasted(found: Mapping[str, Any]) -> Iterator[str]:
     home = str(Path.home())
     yield from (text.replace(home, "~") for text in (*lost, f"chromium: {found['chromium']}", f"vulkan: {found['vulkan']}"))
     yield "```"
-
-
-def _memory() -> float:
-    return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
 
 
 def _packages() -> dict[str, str | None]:

@@ -164,19 +164,11 @@ def _shown(data: Mapping[str, Any]) -> dict[str, Any]:
     """What a progress tells, without objects."""
     kept = {k: data[k] for k in ("done", "total", "unit", "part", "text", "best") if data.get(k) is not None}
     if "best" in kept:
-        kept["best"] = {name: _finite(value) for name, value in kept["best"].items()}
+        # JSON has no infinite numbers.
+        kept["best"] = {n: str(v) if isinstance(v, float) and not math.isfinite(v) else v for n, v in kept["best"].items()}
     return {k: v[:LONGEST] if isinstance(v, str) else v for k, v in kept.items()}
 
 
-def _finite(value: Any) -> Any:
-    """JSON has no infinite numbers."""
-    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def _encoded(line: Mapping[str, Any]) -> bytes:
-    return json.dumps(line, default=_plain, ensure_ascii=False).encode() + b"\n"
-
-
-def _plain(value: Any) -> Any:
-    """NumPy's numbers as Python's; anything else as text."""
-    return value.item() if hasattr(value, "item") else str(value)
+    """With NumPy's numbers as Python's; anything else as text."""
+    return json.dumps(line, default=lambda v: v.item() if hasattr(v, "item") else str(v), ensure_ascii=False).encode() + b"\n"

@@ -182,9 +182,11 @@ def _same(
     k, _ = np.unravel_index(int(np.argmax(d)), d.shape)
     z = np.concatenate([rows.x[index][k], rows.u[index][k]])
     move = np.abs(difference(system.states, first.x, rows.x)).mean(axis=0)
+    # A quaternion has three numbers of a difference.
+    columns = [s.name for s in system.states for _ in range(3 if s.kind == "quaternion" else 1)]
     each = ", ".join(
         f"{name} by {worst:.3g}" + (f" ({worst / m:.2g} of its mean move)" if m > 0 else "")
-        for name, worst, m in zip(_columns(system), d.max(axis=0), move, strict=True)
+        for name, worst, m in zip(columns, d.max(axis=0), move, strict=True)
         if worst > 0
     )
     raise UsageError(
@@ -192,11 +194,6 @@ def _same(
         f"{d.max():.3g}{hidden}{': ' + each if each else ''}; worst at (x, u) = {z.tolist()}; make it restore its whole state "
         f"before every query (warm starts, contact caches, sleeping)"
     )
-
-
-def _columns(system: System) -> list[str]:
-    """One name per number of a difference; a quaternion has three."""
-    return [s.name for s in system.states for _ in range(3 if s.kind == "quaternion" else 1)]
 
 
 def _close(a: Array | None, b: Array | None) -> bool:

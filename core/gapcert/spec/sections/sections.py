@@ -63,10 +63,6 @@ def _seconds(value: Any) -> float:
     return seconds
 
 
-def _time(value: Any) -> float:
-    return magnitude(value, "s")
-
-
 def _share(value: Any) -> float:
     share = magnitude(value, "1") if not isinstance(value, str) else magnitude(value.replace("%", "").strip(), "1") / 100
     if not 0 < share < 1:
@@ -100,7 +96,7 @@ RouteName = Annotated[str, BeforeValidator(_route), Routes]
 Bound = Annotated[float | str, BeforeValidator(_bound), _QUANTITY]
 Boxes = dict[str, tuple[Bound, Bound]]
 Seconds = Annotated[float, BeforeValidator(_seconds), _SECONDS]
-Time = Annotated[float, BeforeValidator(_time), _SECONDS]
+Time = Annotated[float, BeforeValidator(lambda value: magnitude(value, "s")), _SECONDS]
 Share = Annotated[float, BeforeValidator(_share), _SHARE]
 
 
