@@ -82,11 +82,11 @@ def pushes(
 
 
 def _commanded(found: Sequence[_Found], measured: Dataset) -> bool:
-    """Do they come after jumps of an input more often than chance has it? Then a law makes them."""
-    size, after = np.std(np.concatenate(measured.inputs), axis=0), list[Bools]()
+    """Do they come where an input has just changed more often than chance has it? Then a law makes them."""
+    size, lag, after = np.std(np.concatenate(measured.inputs), axis=0), measured.samples(THRESHOLDS.short_window), list[Bools]()
     for u in measured.inputs:
-        jumps = np.any(np.abs(np.diff(u, axis=0, prepend=u[:1])) > THRESHOLDS.jump * size, axis=1)
-        after.append(np.convolve(jumps, np.ones(measured.samples(THRESHOLDS.short_window) + 1))[: len(u)] > 0)
+        moved = u - np.concatenate([np.repeat(u[:1], lag, axis=0), u])[: len(u)]
+        after.append(np.any(np.abs(moved) > THRESHOLDS.jump * size, axis=1))
     starts = [(after[f.piece], int(np.searchsorted(measured.times[f.piece], f.stretch[0]))) for f in found]
     begun, share = [bool(near[min(k, len(near) - 1)]) for near, k in starts], float(np.mean(np.concatenate(after)))
     return bool(binom.sf(sum(begun) - 1, len(begun), share) < THRESHOLDS.by_command)
@@ -157,9 +157,13 @@ def _strongest(model: Model, last: Fit, measured: Dataset, length: int) -> Itera
     rest = max(1.0, float(np.median((energy - gains) / np.maximum(np.sum(windows.weight**2, axis=(1, 2)), 1))))
     chance = THRESHOLDS.push_beyond * rest * charge(len(sites) * len(first) * len(row))
     plain = gains > THRESHOLDS.push_share * (energy - np.median(energy))
-    # What moves outputs by less than 1.5 noise floors, from its beginning on, may be an integrator's.
-    begun = edges[first[np.stack(best, axis=-1)[row, most.argmax(axis=1)]]]
+    # What moves outputs by less than 1.5 noise floors from its beginning on, or is little force, may be an integrator's.
+    best_site = most.argmax(axis=1)
+    begun = edges[first[np.stack(best, axis=-1)[row, best_site]]]
     plain &= gains > THRESHOLDS.loud_channel**2 * rest * (1 - begun / steps) * length
+    effort = np.array([np.sqrt(np.mean(motion.effort(site) ** 2)) for site in sites])
+    size = np.abs(np.stack([f[row, i] for f, i in zip(force, best, strict=True)], axis=-1))[row, best_site]
+    plain &= size > THRESHOLDS.least_effort * effort[best_site]
     for w, t in enumerate(windows.t.tolist()):
         forces = {}
         for i in np.argsort(-most[w], kind="stable").tolist():
