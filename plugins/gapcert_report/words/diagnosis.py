@@ -19,7 +19,7 @@ SETTINGS = {
     "use_inertia_from_file": "whether links have the file's inertia",
 }
 # What has no plural has no article.
-_STUFF = {"friction", "drag", "cogging", "backlash", "coupling", "slip", "saturation", "quantisation", "play"}
+_STUFF = {"friction", "drag", "cogging", "backlash", "coupling", "slip", "saturation", "quantisation", "play", "hysteresis"}
 
 
 def cause_name(cause: Summary) -> str:
@@ -54,7 +54,10 @@ def plus_minus(value: float, low: float, high: float) -> str:
 
 
 def amount(cause: Summary) -> str:
-    """A cause's numbers with their units: `0.131 ± 0.004 N·m`, or `plus 158 ± 2 N·s/m and minus 232 ± 3 N·s/m`."""
+    """A cause's numbers with their units: `0.131 ± 0.004 N·m`, or `plus 158 ± 2 N·s/m and minus 232 ± 3 N·s/m`; of a curve how
+    many it has."""
+    if len(cause["parameters"]) > 4:
+        return f"drawn through {len(cause['parameters'])} points"
     parts = []
     for name, p in cause["parameters"].items():
         given = measured(plus_minus(p["value"], p["low"], p["high"]), p["unit"])
