@@ -449,12 +449,19 @@ def _sized(case: Case, h: Hidden, at: Any, most: float, rng: np.random.Generator
 
 
 def ask(case: Case, limit: float, effects: Any = "all") -> dict[str, Any]:
-    """The record of a case; an answer from outside its class is put to the test, and a single cause that fits joins it."""
+    """The record of a case; an answer from outside its class is put to the test, and a single cause that fits joins it.
+
+    floors: by channel, the noise floor that was found over the noise that is there.
+    """
     r = case.rig
     recording = case.recording()
-    record = case.question() | sit.timed(
-        lambda: sit.answer(gc.diagnose(sit.model(r.section), recording, effects, horizons=[r.horizon])), limit
-    )
+
+    def answered() -> dict[str, Any]:
+        found = gc.diagnose(sit.model(r.section), recording, effects, horizons=[r.horizon])
+        true = dict(zip(r.view, r.noise.std(axis=0)[r.columns], strict=True))
+        return sit.answer(found) | {"floors": {n: round(m.noise_floor / true[n], 2) for n, m in found.residual.items()}}
+
+    record = case.question() | sit.timed(answered, limit)
     said = [Hidden(c["effect"], c["site"], c["numbers"]) for c in record.get("causes", [])]
     known = {tuple(k) for c in record["classes"] for k in c}
     if not case.hidden or not said or all(h.key in known for h in said):

@@ -1,4 +1,4 @@
-"""Plants of another hand: their own integrator against the equations that a user would write, and cases that are what they say."""
+"""Plants of another hand: their integrator against the equations that a user would write, and cases that are what they say."""
 
 from dataclasses import replace
 
@@ -79,7 +79,8 @@ def test_clear_cases_are_as_strong_as_they_say():
         case = plain.single("t", 1, index)
         judge = plain.Judge(case.rig, case.hidden)
         assert case.label == "clear"
-        assert judge.strength() == pytest.approx(case.strength) and case.strength >= 5
+        assert judge.strength() == pytest.approx(case.strength)
+        assert case.strength >= 5
         assert judge.fit(case.hidden)[0] - judge.own < 9
         assert case.remains >= 1 or judge.fit()[1] >= 25
 
