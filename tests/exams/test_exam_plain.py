@@ -42,6 +42,17 @@ def test_plants_move_as_their_equations_say(name):
     assert np.abs(simulated(r, u) - y).max() < 0.05 * r.noise.std(axis=0).min()
 
 
+def test_a_strut_feels_the_speed_that_is_played():
+    r = exact("strut")
+    _, y, v = r.play()
+    k, c, dry, soft = r.true
+    x = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * r.period)])
+    assert np.allclose(y[:, 0], x, atol=1e-9)
+    assert np.allclose(y[:, 1], k * x + c * v + dry * np.tanh(v / soft), rtol=1e-6, atol=1e-6 * y[:, 1].std())
+    late = r.play((Hidden("input-delay", "v", {"delay": 3 * r.period}),))[1]
+    assert np.allclose(late[3:, 1], y[:-3, 1], atol=1e-3 * y[:, 1].std())
+
+
 @pytest.mark.parametrize(
     ("name", "effect", "numbers"),
     [

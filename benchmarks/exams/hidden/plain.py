@@ -99,6 +99,8 @@ def commanded(u: Array, first: int, sub: int, at: float, straight: bool, before:
     n = math.floor(at / sub if straight else at)
     part = (at / sub if straight else at) - n
     a, b = (n, n + 1) if straight else (n // sub, (n + 1) // sub)
+    if straight and a < first:
+        return before
     here = before if a < first else u[a]
     then = before if b < first else u[min(b, len(u) - 1)]
     return (1 - part) * here + part * then
