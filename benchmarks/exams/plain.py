@@ -121,6 +121,7 @@ def rig(p: Plant, kind: str, rng: np.random.Generator) -> Rig:
         horizon,
         kind + (f", {runs} runs" if short else ""),
         p.hold,
+        rho,
     )
     sigma = math.exp(rng.uniform(math.log(0.001), math.log(0.03))) * np.std(made.play()[1], axis=0)
     return replace(made, noise=noise * sigma)
@@ -170,7 +171,7 @@ class Case:
             "dirt": [],
             "engine": None,
             "tolerance": r.tolerance,
-            "colour": float(_colour(r.noise[:, 0])),
+            "colour": r.colour,
             "noise": [float(f"{s:.3g}") for s in r.noise.std(axis=0)[r.columns]],
             "hidden": [{"effect": h.effect, "site": h.site, "numbers": sit.plain(h.numbers)} for h in self.hidden],
             "label": self.label,
@@ -178,10 +179,6 @@ class Case:
             "remains": round(self.remains, 3),
             "classes": [[list(k) for k in alike(r, h)] for h in self.hidden],
         }
-
-
-def _colour(e: Array) -> float:
-    return round(float(np.corrcoef(e[1:], e[:-1])[0, 1]), 1)
 
 
 def alike(r: Rig, h: Hidden) -> list[tuple[str, str]]:
@@ -269,7 +266,10 @@ class Judge:
         def rest(z: Array) -> Array:
             with np.errstate(all="ignore"):
                 out = self.misfit(*parts(z))
-            return np.nan_to_num(out, nan=1e6, posinf=1e6, neginf=-1e6)
+            out = np.nan_to_num(out, nan=1e6, posinf=1e6, neginf=-1e6)
+            # As coloured noise would be made white: what is slow is worth less beside it.
+            out[1:] = (out[1:] - r.colour * out[:-1]) / math.sqrt(1 - r.colour**2)
+            return out
 
         def cost(e: Array, z: Array) -> float:
             own = z[len(keys) : len(keys) + len(loose)]
@@ -302,7 +302,7 @@ class Judge:
                 damp = max(30 * damp, 1e-4)
             if best > before * (1 - 1e-3):
                 break
-        return best, float(z[len(keys) : few] @ z[len(keys) : few]), _largest(e)
+        return best, float(z[len(keys) : few] @ z[len(keys) : few]), _largest(self.misfit(*parts(z)))
 
     @property
     def own(self) -> float:

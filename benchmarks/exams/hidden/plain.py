@@ -392,7 +392,8 @@ def plant(name: str, rng: np.random.Generator) -> Plant:
 class Rig:
     """A plant with its true numbers and those it is stated to have, as it is played and measured.
 
-    u (T,), reference (T,), noise (T, ny) in the outputs' units, begins (T,), starts (runs, nx); view: measured outputs.
+    u (T,), reference (T,), noise (T, ny) in the outputs' units, begins (T,), starts (runs, nx); view: measured
+    outputs; colour: lag-1 autocorrelation of the noise.
     """
 
     plant: Plant
@@ -411,6 +412,7 @@ class Rig:
     horizon: float
     excitation: str
     hold: Literal["zero", "first"]
+    colour: float
 
     @property
     def section(self) -> dict[str, Any]:
