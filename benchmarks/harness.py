@@ -7,6 +7,7 @@ import json
 import os
 import platform
 import statistics
+import subprocess
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
@@ -79,6 +80,14 @@ def machine() -> dict[str, str | int | float]:
         "system": platform.platform(),
         "python": platform.python_version(),
     }
+
+
+def commit() -> str:
+    """Short, with a + where files differ from it."""
+    asked = ("rev-parse", "--short", "HEAD"), ("status", "--porcelain", "../core", "../plugins")
+    here = Path(__file__).parent
+    at, changed = (subprocess.run(["git", *a], cwd=here, capture_output=True, text=True).stdout.strip() for a in asked)
+    return at + ("+" if changed else "")
 
 
 def table(rows: Iterable[Row]) -> str:

@@ -17,7 +17,6 @@ import argparse
 import importlib
 import json
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -32,6 +31,7 @@ from typing import Any
 import harness
 import numpy as np
 from attacks import KINDS, Attempt
+from harness import commit
 from scipy.stats import binom
 
 from gapcert_verify import verify_run
@@ -44,13 +44,6 @@ PATIENCE = 900
 """Seconds for one claim."""
 BATCH = 200
 """Claims that the same workers attack."""
-
-
-def commit() -> str:
-    """Short, with a + where files differ from it."""
-    told = [subprocess.run(["git", *args], cwd=ROOT, capture_output=True, text=True).stdout.strip() for args in (
-        ("rev-parse", "--short", "HEAD"), ("status", "--porcelain", "core", "plugins"))]  # fmt: skip
-    return told[0] + ("+" if told[1] else "")
 
 
 def asked(kind: str, seed: int, k: int, tries: int | None) -> dict[str, Any]:

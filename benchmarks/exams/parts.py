@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from exams import plain as plants
 from exams import play, score, sit
 from exams.hidden import draw
 from exams.score import Rate, Record
@@ -141,6 +142,19 @@ def engines(records: Sequence[Record]) -> list[Figure]:
     return out
 
 
+def plain(records: Sequence[Record]) -> list[Figure]:
+    clear = [r for r in records if r["label"] == "clear"]
+    lone, loops = [r for r in clear if score.alone(r)], [r for r in clear if r["excitation"].startswith("feedback")]
+    return [
+        least(f"exact name and site first, class of one ({len(lone)})", score.rate(lone, score.exact), 0.95),
+        least(f"class first, all ({len(clear)})", score.rate(clear, score.in_class), 0.98),
+        least(f"class first, under feedback ({len(loops)})", score.rate(loops, score.in_class), 0.93),
+        most("a wrong name stated as certain", score.rate(clear, score.certain_and_wrong), 0.01),
+        Figure("median error of the numbers of right answers", "share", score.median(score.sizes(clear)), goal=0.02),
+        Figure("CPU time, median", "s", score.median([r["cpu"] for r in records])),
+    ]
+
+
 def _dirty(seed: int, index: int, limit: float) -> Record:
     """Even cases are clean, odd ones are the case before, soiled."""
     from exams.hidden.log import DIRT
@@ -159,6 +173,9 @@ PARTS = {
     "dirty": Part(160, 4, _dirty, dirty),
     "engines": Part(128, 4, lambda s, i, t: sit.sit(draw.on_engine("engines", s, i), t), engines),
     "experiments": Part(120, 2, play.experiment, experiments),
+    "plain": Part(400, 20, lambda s, i, t: plants.ask(plants.single("plain", s, i), t), plain),
+    "plain-nothing": Part(600, 9, lambda s, i, t: plants.ask(plants.nothing("plain-nothing", s, i), t), nothing),
+    "plain-unknown": Part(150, 4, lambda s, i, t: plants.unknown("plain-unknown", s, i, t), unknown),
     "joints": Part(
         72, 2, lambda s, i, t: sit.sit(draw.single("joints", s, i, (("arm",), ("cartpole",), ("chain",))[i % 3]), t), joints
     ),

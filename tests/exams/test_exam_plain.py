@@ -1,0 +1,122 @@
+"""Plants of another hand: their integrator against the equations that a user would write, and cases that are what they say."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from exams import plain, store
+from exams.hidden.laws import Hidden
+from exams.hidden.plain import NAMES, RUN, plant
+
+import gapcert as gc
+from gapcert_diagnosis.testing import equations
+
+
+def exact(name, excitation="multisine", seed=3):
+    """A single run of a plant that is as it is stated."""
+    for k in range(30):
+        rng = np.random.default_rng([seed, k])
+        r = plain.rig(plant(name, rng), excitation, rng)
+        if (r.begins == RUN).sum() == 1:
+            r = replace(r, stated=r.true)
+            return replace(r, u=r.u[:400], noise=r.noise[:400], reference=r.reference[:400], begins=r.begins[:400])
+    raise AssertionError
+
+
+def simulated(r, u, found=None, hidden=None):
+    model = equations({**r.section, "substeps": r.sub})
+    if found is not None:
+        numbers = dict(zip([p.name for p in found.named(hidden.site, model)], hidden.numbers.values(), strict=True))
+        extension = found.extension(hidden.site, model)
+        model = model.extend(
+            [replace(extension, parameters=tuple(replace(p, value=numbers[p.name]) for p in extension.parameters))]
+        )
+    x = model.rollout(r.starts[:1], u[None, :-1, None]).x[0]
+    return model.output(x, u[:, None])
+
+
+@pytest.mark.parametrize("name", [n for n in NAMES if n != "strut"])
+def test_plants_move_as_their_equations_say(name):
+    r = exact(name)
+    _, y, u = r.play()
+    assert np.abs(simulated(r, u) - y).max() < 0.05 * r.noise.std(axis=0).min()
+
+
+def test_a_strut_feels_the_speed_that_is_played():
+    r = exact("strut")
+    _, y, v = r.play()
+    k, c, dry, soft = r.true
+    x = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * r.period)])
+    assert np.allclose(y[:, 0], x, atol=1e-9)
+    assert np.allclose(y[:, 1], k * x + c * v + dry * np.tanh(v / soft), rtol=1e-6, atol=1e-6 * y[:, 1].std())
+    late = r.play((Hidden("input-delay", "v", {"delay": 3 * r.period}),))[1]
+    assert np.allclose(late[3:, 1], y[:-3, 1], atol=1e-3 * y[:, 1].std())
+
+
+@pytest.mark.parametrize(
+    ("name", "effect", "numbers"),
+    [
+        ("motor", "coulomb-friction", {"level": 40.0}),
+        ("wheel", "quadratic-drag", {"coefficient": 0.5}),
+        ("heater", "external-push", {"force": 0.02, "time": 300.0, "duration": 200.0}),
+        ("rc", "input-delay", {"delay": 0.004}),
+        ("rlc", "input-lag", {"time_constant": 0.02}),
+        ("cylinder", "input-rate-limit", {"rate": 30.0}),
+        ("twin", "supply-sag", {"sag": 3.0, "time_constant": 0.5}),
+        ("tank", "sensor-scale", {"scale": 1.1}),
+    ],
+)
+def test_effects_act_as_the_library_writes_them(name, effect, numbers):
+    r = exact(name)
+    site = plain.places(effect, r.plant, r.view)[0]
+    hidden = Hidden(effect, site, numbers)
+    _, y, u = r.play((hidden,))
+    still = r.play()[1]
+    found = gc.registry().build("effect", effect)
+    assert np.abs(simulated(r, u, found, hidden) - y).max() < 0.02 * np.abs(still - y).max()
+
+
+def test_a_case_is_a_function_of_its_seed_and_index():
+    a, b, other = (plain.single("t", seed, 3) for seed in (1, 1, 2))
+    assert a.question() == b.question()
+    one, two = (c.recording().trajectories[0].channels for c in (a, b))
+    assert all(np.array_equal(one[n], two[n]) for n in one)
+    assert a.hidden[0].numbers != other.hidden[0].numbers
+
+
+@pytest.mark.exam
+def test_clear_cases_are_as_strong_as_they_say():
+    for index in (3, 8, 14, 18):
+        case = plain.single("t", 1, index)
+        judge = plain.Judge(case.rig, case.hidden)
+        assert case.label == "clear"
+        assert judge.strength() == pytest.approx(case.strength)
+        assert case.strength >= 5
+        assert judge.fit(case.hidden)[0] - judge.own < 9
+        assert case.remains >= 1 or judge.fit()[1] >= 25
+
+
+def test_what_no_data_could_tell_apart_is_one_class():
+    r = exact("wheel")
+    keys = plain.alike(r, Hidden("input-gain", "u", {"gain": 1.3}))
+    assert set(keys) == {("input-gain", "u"), ("sensor-scale", "v"), ("parameter", "K")}
+    judge = plain.Judge(r, (Hidden("input-gain", "u", {"gain": 1.3}),))
+    for said in (Hidden("sensor-scale", "v", {"scale": 1.2}), Hidden("parameter", "K", {"value": 1.2 * r.true[0]})):
+        assert judge.stands((said,), 1)[0]
+    assert not judge.stands((Hidden("input-offset", "u", {"offset": 1.0}),), 1)[0]
+
+
+def test_under_feedback_the_input_comes_from_what_was_measured():
+    r = exact("wheel", "feedback")
+    _, y, u = r.play()
+    column = r.view[0]
+    proportional, _, _, middle, half, _ = r.law
+    asked = middle + proportional * (r.reference[0] - y[0, r.plant.shown.index(column)] - r.noise[0, 0])
+    assert u[0] == pytest.approx(np.clip(asked, middle - half, middle + half))
+    assert not np.array_equal(u, r.play(noisy=False)[2])
+
+
+def test_answers_keep_the_commit(tmp_path, capsys):
+    kept = tmp_path / "answers.jsonl"
+    kept.write_text('{"part": "plain", "seed": 1, "index": 0, "commit": "abc"}\n')
+    assert [r["commit"] for r in store.sittings(print, [("plain", 1, 0, 1.0)], 1, kept)] == ["abc"]
