@@ -240,7 +240,7 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
     # As the answer holds the inputs, and as its fit finds starts best.
     judges = stretches(replace(data.held, hold=answer.dataset.hold), problem.horizons, answer.fit)
     judge, settings = judges[-1], settled.settings
-    answer = _largest_first(decided(answer, judge), judge)
+    answer = _largest_first(decided(answer, judge, seed), judge)
     named = tuple(_set(answer, s, judge) for s in settings) + tuple(_named(answer, c, judge) for c in answer.causes)
     named += tuple(_read(answer, c, numbers, judge) for c, numbers in answer.library.seen)
     if calm is not None:

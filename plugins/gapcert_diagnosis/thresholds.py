@@ -291,7 +291,6 @@ class Thresholds:
     second_fit: int = chosen(6, "of the longer of two short fits")
     short_fit_window: float = chosen(0.3, "s: starts are found from anywhere in short windows")
     plain_residual: float = decides(5.0, "noise floors without a cause of little force, from which its size is no objection")
-    halved_error: float = chosen(0.5, "of that of long rollouts without it, below which a cause matters however small it is")
     foretold_share: float = chosen(0.8, "of a rival's error on held-out data, above which both are as good there")
     little_force_share: tuple[float, float] = chosen((0.5, 0.8), "of the residual that such a cause must explain; where rough")
     hoped_fall: float = chosen(8.0, "of the squared residual that screening promises: nothing is tried for less")

@@ -160,8 +160,11 @@ class InputCurve(Law):
         """Knots, as shares of the peak, as far apart on either side of zero, where both are used, and over the range."""
         made, half = InputCurve(), len(self.knots) // 2
         low, high, made.reach = (scales[f"input_{end}"] for end in ("low", "high", "peak"))
+        # An input that does not change has no range of its own.
+        low, high = (low, high) if high - low > THRESHOLDS.little_used * made.reach else (-made.reach, made.reach)
         both = np.concatenate([np.linspace(low, 0, half, endpoint=False), np.linspace(0, high, half + 1)])
-        made.knots = np.round((both if low < 0 < high else np.linspace(low, high, len(self.knots))) / made.reach, 4)
+        used = min(-low, high) > THRESHOLDS.little_used * made.reach
+        made.knots = np.round((both if used else np.linspace(low, high, len(self.knots))) / made.reach, 4)
         return made
 
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:

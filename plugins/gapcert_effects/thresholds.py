@@ -17,6 +17,7 @@ class Thresholds:
     agreeing_parts: int = chosen(64, "of the data, whose forces must agree on a period")
     agreeing: float = threshold(10.0, "times what chance makes of them: by the formula, at one period in 22,000")
     outstanding: int = chosen(2, "periods that data suggest, at most: one may be a harmonic of the other")
+    little_used: float = chosen(0.02, "of an input's peak: a side of its range, or a range, that is no longer has no knots")
     knots: int = chosen(7, "of a curve drawn through the data: three on either side of zero")
     push_starts: int = chosen(80, "tried: the width of a push grows with the length of the recording")
     latest_input: float = chosen(0.1, "of the duration of the data, that an input comes late at most")

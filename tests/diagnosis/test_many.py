@@ -89,7 +89,7 @@ def test_a_law_is_screened_at_all_its_sites_in_one_pass(monkeypatch):
     search, passes = FittedSets(library, windows), []
     at_once, alone = (Screen(library, windows, search.nothing) for _ in range(2))
     plain = Screen._moved
-    monkeypatch.setattr(Screen, "_moved", lambda self, model, given, n: passes.append(n) or plain(self, model, given, n))
+    monkeypatch.setattr(Screen, "_moved", lambda self, m, given, n, **k: passes.append(n) or plain(self, m, given, n, **k))
     at_once._at_once(library.candidates)
     assert len(passes) == 2
     for c in library.candidates:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import final
@@ -12,6 +13,7 @@ from gapcert.plugin import Model
 from gapcert_diagnosis.data.dataset import Dataset, Windows
 from gapcert_diagnosis.fitting.fit import Fit
 from gapcert_diagnosis.fitting.rollout_error import Stretches
+from gapcert_diagnosis.residual.adequacy import by_noise
 from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_engines import EngineModel
 
@@ -77,13 +79,16 @@ def answered(search: FittedSets, found: Found, windows: Windows) -> Answer:
     return _told(answer if simplest[0] == causes else answer.with_answer(simplest))
 
 
-def decided(answer: Answer, judge: Stretches) -> Answer:
+def decided(answer: Answer, judge: Stretches, seed: int) -> Answer:
     """As held-out data have it: a tie that foretells them plainly worse is none, one that does so plainly better is the answer,
     and a rival that does is a tie."""
-    ties, judged = {keys(f[0]): f for f in answer.ties}, (judge.floors, judge.blocks)
+    ties = {keys(f[0]): f for f in answer.ties}
+    if judge.windows.measured.exact:
+        return answer
 
     def foretells(new: Fit, old: Fit) -> bool:
-        return ahead(*(ask(f) for ask in judged for f in (new, old)))
+        due = functools.partial(by_noise, judge, old, seed)
+        return ahead(judge.floors(new), judge.floors(old), judge.blocks(new), judge.blocks(old), due)
 
     runners_up = [f for found in answer.rivals.values() for f in found[:1] if keys(f[0]) not in ties]
     surprising = [f for f in runners_up if foretells(f[1], answer.fit)]

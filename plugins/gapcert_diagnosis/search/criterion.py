@@ -8,7 +8,7 @@ squared residual of a channel over that of noise, G the charge for one more caus
 | `noise`        | a fit, the noise floor           | χ ≤ max(`noise_level`, 1 + chance) in all channels    | everyone       |
 | `pays`         | a set, one without some causes   | χ falls, ΔS > G; z > `sure_errors` if it falls little | steps, drops   |
 | `decides`      | a set, one without one cause     | χ > `plain_residual`² without it, most of that gone   | `matters`      |
-| `halves`       | rollouts with and without a cause | error > `loud_channel` without it, half with it      | `matters`      |
+| `halves`       | rollouts with and without a cause | error > `loud_channel` without it, most gone with it  | `matters`      |
 | `ahead`        | two sets, on held-out data       | noise, beside no noise; or blocks agree by `surely`   | ties, rivals   |
 | `outdoes`      | a set, one on another path       | ΔS > 0; if it is larger ΔS > G, and it pays           | steps          |
 | `beats`        | two causes at once, single steps | ΔS > `tie_score`; ΔS > 0 if they are fewer            | pairs          |
@@ -26,7 +26,7 @@ Where a search is cautious and the closer of two fits is rough, ΔS is at most z
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -100,23 +100,24 @@ def decides(whole: Fit, without: Fit) -> bool:
 
 
 def halves(whole: Array, without: Array) -> bool:
-    """Is the error (ny,) of long rollouts, in noise floors, plainly above the noise without a cause, and half with it, noise
-    aside?"""
-    rest, before = whole**2 - 1, without**2 - 1
-    return bool(((without > THRESHOLDS.loud_channel) & (rest < THRESHOLDS.halved_error**2 * before)).any())
+    """Is the error (ny,) of long rollouts, in noise floors, above the noise without a cause, and most of it gone with it?"""
+    rest, before = (float(np.sum(np.maximum(e**2 - 1, 0.0))) for e in (whole, without))
+    most = THRESHOLDS.little_force_share[bool((whole**2 > THRESHOLDS.rough).any())]
+    return bool((without > THRESHOLDS.loud_channel).any() and rest < (1 - most) ** 2 * before)
 
 
-def ahead(floors: Array, others: Array, blocks: Array, other_blocks: Array) -> bool:
+def ahead(floors: Array, others: Array, blocks: Array, other_blocks: Array, due: Callable[[], Array]) -> bool:
     """Does one set foretell held-out data plainly better than another?
 
     floors (ny,): errors of rollouts in noise floors; blocks (k,): E² of stretches that share no data. It does where its errors
-    are noise and the other's twice as much and none, or where the blocks' falls of ln E² are beyond chance (Student's t).
+    are noise and the other's twice as much and none, or where the blocks' falls of ln E² are beyond chance (Student's t); due:
+    errors that noise would make of the other one, were it true, which its own have to exceed.
     """
-    if (floors <= THRESHOLDS.loud_channel).all() and (others > np.maximum(THRESHOLDS.loud_channel, 2 * floors)).any():
-        return True
+    noise_beside = (floors <= THRESHOLDS.loud_channel).all() and (others > 2 * floors).any()
     beyond = stdtrit(max(1, len(blocks) - 1), ndtr(THRESHOLDS.sure_errors))
     less = blocks.mean() < THRESHOLDS.foretold_share**2 * other_blocks.mean()
-    return bool(less and agreement(np.log(other_blocks + 1e-300) - np.log(blocks + 1e-300)) > beyond)
+    plain = noise_beside or (less and agreement(np.log(other_blocks + 1e-300) - np.log(blocks + 1e-300)) > beyond)
+    return bool(plain and (others > THRESHOLDS.loud_channel).any() and (others > THRESHOLDS.loud_channel * due()).any())
 
 
 def outdoes(new: Fit, best: Fit, charge: float, rough: float | None = None, *, larger: bool) -> bool:
