@@ -93,7 +93,7 @@ def test_any_faults_on_the_way_of_both_inputs_can_be_written_down():
     faults = [e for n in gc.registry().names("effect") if (e := gc.registry().build("effect", n)).site == "input"]
     faults.sort(key=lambda e: -e.stage)
     extended = nominal.extend([e.extension(site, nominal) for e in faults for site in nominal.sites("input")])
-    assert len(faults) == 9
+    assert len(faults) == 11
     u = np.zeros((1, 2))
     assert extended.step(np.zeros((1, 2)), u).x == pytest.approx(np.zeros((1, 2)))
 

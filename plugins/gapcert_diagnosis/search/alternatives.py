@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import final
@@ -87,8 +86,8 @@ def decided(answer: Answer, judge: Stretches, seed: int) -> Answer:
         return answer
 
     def foretells(new: Fit, old: Fit) -> bool:
-        due = functools.partial(by_noise, judge, old, seed)
-        return ahead(judge.floors(new), judge.floors(old), judge.blocks(new), judge.blocks(old), due)
+        errors = judge.floors(new), judge.floors(old), judge.blocks(new), judge.blocks(old)
+        return ahead(*errors, lambda: [by_noise(judge, f, seed) for f in (new, old)])
 
     runners_up = [f for found in answer.rivals.values() for f in found[:1] if keys(f[0]) not in ties]
     surprising = [f for f in runners_up if foretells(f[1], answer.fit)]

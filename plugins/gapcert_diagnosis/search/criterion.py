@@ -106,18 +106,21 @@ def halves(whole: Array, without: Array) -> bool:
     return bool((without > THRESHOLDS.loud_channel).any() and rest < (1 - most) ** 2 * before)
 
 
-def ahead(floors: Array, others: Array, blocks: Array, other_blocks: Array, due: Callable[[], Array]) -> bool:
+def ahead(floors: Array, others: Array, blocks: Array, other_blocks: Array, due: Callable[[], Sequence[Array]]) -> bool:
     """Does one set foretell held-out data plainly better than another?
 
     floors (ny,): errors of rollouts in noise floors; blocks (k,): E² of stretches that share no data. It does where its errors
-    are noise and the other's twice as much and none, or where the blocks' falls of ln E² are beyond chance (Student's t); due:
-    errors that noise would make of the other one, were it true, which its own have to exceed.
+    are noise and the other's twice as much and none, or where the blocks' falls of ln E² are beyond chance (Student's t). due:
+    errors that noise would make of either, were it true, which the other's have to exceed by more.
     """
     noise_beside = (floors <= THRESHOLDS.loud_channel).all() and (others > 2 * floors).any()
     beyond = stdtrit(max(1, len(blocks) - 1), ndtr(THRESHOLDS.sure_errors))
     less = blocks.mean() < THRESHOLDS.foretold_share**2 * other_blocks.mean()
     plain = noise_beside or (less and agreement(np.log(other_blocks + 1e-300) - np.log(blocks + 1e-300)) > beyond)
-    return bool(plain and (others > THRESHOLDS.loud_channel).any() and (others > THRESHOLDS.loud_channel * due()).any())
+    if not plain or (others <= THRESHOLDS.loud_channel).all():
+        return False
+    one, two = due()
+    return bool((others / two > THRESHOLDS.loud_channel * np.maximum(1.0, floors / one)).any())
 
 
 def outdoes(new: Fit, best: Fit, charge: float, rough: float | None = None, *, larger: bool) -> bool:
