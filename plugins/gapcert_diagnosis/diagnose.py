@@ -226,25 +226,24 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
     settled, windows = _settled(data, problem)
     lap("search")
 
-    answer = answered(settled.search, settled.found, windows)
+    answer, judges = _judged(settled, windows, data.held, problem)
     pushed = spared("list of pushes", (), _pushes, problem, data, answer)
     more = len(pushed) > sum(c.effect.name == PUSH for c in answer.causes)
     loud = bool((np.sqrt(answer.fit.chi) > THRESHOLDS.loud_channel).any())
     calm = spared("search between pushes", None, data.calm, problem, pushed) if more and loud else None
     if calm is not None:
-        data, plain, whole = calm, answer.nothing, stretches(data.held, problem.horizons, answer.fit)[-1]
+        data, plain, whole = calm, answer.nothing, judges[-1].error(answer.fit)
         settled, windows = _settled(data, replace(problem, effects=[e for e in problem.effects if e.name != PUSH]))
-        answer = replace(answered(settled.search, settled.found, windows), plain=plain)
+        answer, judges = _judged(settled, windows, data.held, problem)
+        answer = replace(answer, plain=plain)
     elif settled.settings:
         answer = replace(answer, plain=fit(data.library.hypothesis(()), answer.fit.windows))
-    # As the answer holds the inputs, and as its fit finds starts best.
-    judges = stretches(replace(data.held, hold=answer.dataset.hold), problem.horizons, answer.fit)
     judge, settings = judges[-1], settled.settings
-    answer = _largest_first(decided(answer, judge, seed), judge)
+    answer = _largest_first(answer, judge)
     named = tuple(_set(answer, s, judge) for s in settings) + tuple(_named(answer, c, judge) for c in answer.causes)
     named += tuple(_read(answer, c, numbers, judge) for c, numbers in answer.library.seen)
     if calm is not None:
-        named += _outside(pushed, _share(judge.error(answer.fit), whole.error(answer.fit)))
+        named += _outside(pushed, _share(judge.error(answer.fit), whole))
     lap("rivals")
 
     gain = {f"{j.horizon:g}": j.gains(answer.nothing, answer.fit, seed) for j in judges}
@@ -294,6 +293,15 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
         refitted=_refitted(answer),
         pushes=pushed,
     )
+
+
+def _judged(
+    settled: Settled, windows: Windows, held: Dataset, problem: DiagnosisProblem
+) -> tuple[Answer, tuple[Stretches, ...]]:
+    """The answer as held-out data have it, and rollouts over these: as it holds the inputs, and as its fit finds starts best."""
+    answer = answered(settled.search, settled.found, windows)
+    judges = stretches(replace(held, hold=answer.dataset.hold), problem.horizons, answer.fit)
+    return decided(answer, judges[-1], problem.seed), judges
 
 
 def _settled(data: Data, problem: DiagnosisProblem) -> tuple[Settled, Windows]:
