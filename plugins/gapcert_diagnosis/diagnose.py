@@ -298,7 +298,7 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
 def _judged(
     settled: Settled, windows: Windows, held: Dataset, problem: DiagnosisProblem
 ) -> tuple[Answer, tuple[Stretches, ...]]:
-    """The answer as held-out data have it, and rollouts over these, with inputs held as it does, and leads that suit its fit."""
+    """The answer as held-out data have it, and rollouts over these, with inputs held as it holds them."""
     answer = answered(settled.search, settled.found, windows)
     judges = stretches(replace(held, hold=answer.dataset.hold), problem.horizons, answer.fit)
     return decided(answer, judges[-1], problem.seed), judges
