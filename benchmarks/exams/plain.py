@@ -267,7 +267,7 @@ class Judge:
             with np.errstate(all="ignore"):
                 out = self.misfit(*parts(z))
             out = np.nan_to_num(out, nan=1e6, posinf=1e6, neginf=-1e6)
-            # As coloured noise would be made white: what is slow is worth less beside it.
+            # As coloured noise would be made white: in slow noise, slow differences count less.
             out[1:] = (out[1:] - r.colour * out[:-1]) / math.sqrt(1 - r.colour**2)
             return out
 

@@ -286,7 +286,7 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
         negligible=_negligible(answer),
         smallest=smallest(answer.search) if verdict == "nothing" else (),
         log={**dataset.log, "hold": dataset.hold or "undeclared"},
-        assumptions=(*data.assumptions, *doubted),
+        assumptions=(*data.assumptions, *doubted, *_chosen(answer)),
         # How long the experiments were, of which none tells the ties apart.
         seconds=limits.seconds if answer.ties and limits.inputs and not design else None,
         warnings=(*coarse(answer.fit), *spared.told),
@@ -302,6 +302,12 @@ def _judged(
     answer = answered(settled.search, settled.found, windows)
     judges = stretches(replace(held, hold=answer.dataset.hold), problem.horizons, answer.fit)
     return decided(answer, judges[-1], problem.seed), judges
+
+
+def _chosen(answer: Answer) -> tuple[str, ...]:
+    """That a choice has seen the data by which its gain is measured, in words."""
+    told = "the held-out data, by which the gain is measured, also had a say in which of several rivals is named"
+    return (told,) if answer.chosen else ()
 
 
 def _settled(data: Data, problem: DiagnosisProblem) -> tuple[Settled, Windows]:

@@ -310,7 +310,7 @@ class Thresholds:
     guard_share: float = threshold(0.15, "of the excess over noise: measured, a wrong cause won 3.4 %, a right set 97 %")
     late_residual: float = chosen(1.5, "times that of the earlier windows, from which later ones may hold a push of their own")
     calm_residual: float = chosen(1.02, "times that of the earlier windows, that a law of the later ones may make of it")
-    smaller_sizes: float = chosen(0.7, "of the next one, of laws that are linear in no number: sizes are told to a third")
+    smaller_sizes: float = chosen(0.7, "of the next one, of laws that are linear in no number: sizes are known to a third")
     smaller_rungs: int = chosen(12, "of these below the least of a grid, which is down to a seventieth")
     adequate_residual: float = chosen(1.2, "per noise floor of later data that no simpler law has to improve")
 

@@ -66,22 +66,27 @@ class InputDelay(Law):
         return [(t,) for t in times(self.parameters[0], scales)]
 
 
-@final
-class UnevenDeadZone(Law):
-    """u acts as u − clip(u, −w₋, w₊); an edge below zero lies on the other side of it."""
+class _TwoEdges(Law):
+    """What forms of the dead zone with an edge for each direction share."""
 
-    name = "input-dead-zone-uneven"
     variant_of = "input-dead-zone"
     site = "input"
-    parameters = (_edge("minus"), _edge("plus"))
-    equation = "u − clip(u, −minus, plus) acts"
-    adds: ClassVar = {"input": "{u} - min(max({u}, -{minus}), {plus})"}
-    signature = "small inputs do nothing, in one direction up to a larger one than in the other"
     experiment = SMALL_AND_LARGE
     family = "dead-zone"
     stage = 20
     contains: ClassVar = {"input-dead-zone": {"minus": "width", "plus": "width"}}
     rivals: ClassVar = {"input-offset": SMALL_AND_LARGE, "input-nonlinearity": LEVELS, "backlash": REVERSALS}
+
+
+@final
+class UnevenDeadZone(_TwoEdges):
+    """u acts as u − clip(u, −w₋, w₊); an edge below zero lies on the other side of it."""
+
+    name = "input-dead-zone-uneven"
+    parameters = (_edge("minus"), _edge("plus"))
+    equation = "u − clip(u, −minus, plus) acts"
+    adds: ClassVar = {"input": "{u} - min(max({u}, -{minus}), {plus})"}
+    signature = "small inputs do nothing, in one direction up to a larger one than in the other"
 
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         edges, sides = spread(0.05, 1.0, 5), ((1.0, 1.0), (1.0, 0.3), (0.3, 1.0), (1.0, 0.0), (0.0, 1.0))
@@ -89,21 +94,14 @@ class UnevenDeadZone(Law):
 
 
 @final
-class BentDeadZone(Law):
+class BentDeadZone(_TwoEdges):
     """u acts as max(u − w₊, 0) + ratio·min(u + w₋, 0): beyond its edges a valve may open more in one direction."""
 
     name = "input-dead-zone-bent"
-    variant_of = "input-dead-zone"
-    site = "input"
     parameters = (_edge("minus"), _edge("plus"), EffectParameter("ratio", {}, (0.6, 1.6), 0.05, 20.0, off=1.0))
     equation = "max(u − plus, 0) + ratio·min(u + minus, 0) acts"
     adds: ClassVar = {"input": "max({u} - {plus}, 0) + {ratio}*min({u} + {minus}, 0)"}
     signature = "small inputs do nothing, and larger ones act more strongly in one direction than in the other"
-    experiment = SMALL_AND_LARGE
-    family = "dead-zone"
-    stage = 20
-    contains: ClassVar = {"input-dead-zone": {"minus": "width", "plus": "width"}}
-    rivals: ClassVar = {"input-offset": SMALL_AND_LARGE, "input-nonlinearity": LEVELS, "backlash": REVERSALS}
 
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         return [(*edges, ratio) for edges in UnevenDeadZone().grid(scales)[::2] for ratio in (0.6, 1.6)]
@@ -175,7 +173,7 @@ class InputCurve(Law):
         return [tuple((0.5 * sign * scales["input_peak"] * c).tolist()) for c in some for sign in (1, -1)]
 
     def extension(self, site: str, model: gc.Model) -> Extension:
-        """With the peak as a number of its own, in whose shares the knots x are told.
+        """With the peak as a number of its own; the knots x are shares of it.
 
         c = (c₁ + cₙ)/2 + Σ (sₖ − sₖ₋₁)/2·|u − xₖ| of the slopes s between knots, 0 beyond: each knot names u only once.
         """

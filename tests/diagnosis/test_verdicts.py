@@ -97,6 +97,7 @@ def test_held_out_data_decide_between_what_the_fitted_ones_cannot_tell_apart():
     )
     assert (found.verdict, [c.effect for c in found.causes]) == ("causes", ["input-dead-zone"])
     assert found.ambiguous_with == ()
+    assert any("the held-out data" in a and "had a say" in a for a in found.assumptions)
     rival = found.causes[0].runner_up
     assert rival.effect == "coulomb-friction"
     assert rival.leaves["v"] > 2 * found.gain["1"]["v"].after

@@ -99,7 +99,9 @@ def test_a_valve_opens_on_one_side_first():
 
 
 def test_a_valve_opens_wider_to_one_side():
-    acting = lambda u, h: np.maximum(u - 0.2, 0) + 0.6 * np.minimum(u + 0.05, 0)  # noqa: E731
+    def acting(u, h):
+        return np.maximum(u - 0.2, 0) + 0.6 * np.minimum(u + 0.05, 0)
+
     found = only(told(VALVE, commands(1500, 25, 6), acting), "input-dead-zone")
     assert (found["minus"], found["plus"]) == (pytest.approx(0.05, abs=0.01), pytest.approx(0.2, abs=0.01))
     assert found["ratio"] == pytest.approx(0.6, rel=0.03)

@@ -88,7 +88,7 @@ def _surprise(model: Model, measured: Dataset, i: int, rng: np.random.Generator)
 
 
 def _at_once(model: Model, m: Dataset, i: int) -> list[int]:
-    """Per channel 1 where an unforeseen change of the input shows within the sample in which it comes, else 0."""
+    """Per channel 1 where a sudden change of the input shows within the same sample, else 0."""
     x, u = (np.concatenate(a)[:: max(1, sum(map(len, m.inputs)) // 200)] for a in (m.states, m.inputs))
     sudden = float(np.sqrt(np.mean(np.concatenate([np.diff(a[:, i]) for a in m.inputs]) ** 2)))
     on = u + sudden * (np.arange(model.nu) == i)

@@ -28,7 +28,8 @@ from .stepwise import judge
 class Answer:
     """The final causes and their fit on all windows, sets that explain as much, and per cause what else could stand for it.
 
-    negligible: (effect, site) → share of the effort of what the search met and found too small; plain: the fit of nothing under
+    chosen: did held-out data choose among ties? negligible: (effect, site) → share of the effort of what the search met and
+    found too small; plain: the fit of nothing under
     the settings of the model as it was given, where the search is under others.
     """
 
@@ -39,6 +40,7 @@ class Answer:
     rivals: Mapping[tuple[str, str], tuple[Found, ...]]
     negligible: Mapping[tuple[str, str], float]
     plain: Fit | None = None
+    chosen: bool = False
 
     @property
     def library(self) -> Library:
@@ -92,11 +94,12 @@ def decided(answer: Answer, judge: Stretches, seed: int) -> Answer:
     runners_up = [f for found in answer.rivals.values() for f in found[:1] if keys(f[0]) not in ties]
     surprising = [f for f in runners_up if foretells(f[1], answer.fit)]
     even = [f for f in answer.ties if not foretells(answer.fit, f[1])]
-    answer = replace(answer, ties=(*even, *surprising))
+    chosen = bool(surprising) or len(even) < len(answer.ties)
+    answer = replace(answer, ties=(*even, *surprising), chosen=chosen)
     better = [f for f in even if foretells(f[1], answer.fit)]
     if not better:
         return answer
-    answer = answer.with_answer(min(better, key=lambda f: judge.error(f[1])))
+    answer = replace(answer.with_answer(min(better, key=lambda f: judge.error(f[1]))), chosen=True)
     return replace(answer, ties=tuple(f for f in answer.ties if not foretells(answer.fit, f[1])))
 
 

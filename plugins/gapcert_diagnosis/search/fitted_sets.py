@@ -127,8 +127,9 @@ class FittedSets:
         return self._fits[keys(causes)][1]
 
     def _elsewhere(self, c: Candidate, best: Fit, tried: Sequence[Mapping[str, float]]) -> dict[str, float] | None:
-        """The numbers of a fit with the most promising of those that data suggest for a cause, away from all that were tried:
-        each is a needle, and beside it are others.
+        """The numbers of a fit with the most promising of those that data suggest for a cause, away from all that were tried.
+
+        Each optimum is narrow, and has others near it.
         """
         names, h, known = self.library.names(c), best.hypothesis, best.values
         rows = [dict(zip(names, row, strict=True)) for row in self.library.suggested(c)]
