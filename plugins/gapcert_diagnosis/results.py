@@ -18,7 +18,7 @@ viscous-friction coulomb-friction stribeck-friction lugre-friction dahl-friction
 load-dependent-friction asymmetric-coulomb-friction asymmetric-viscous-friction linear-spring cubic-spring
 constant-force gravity-tilt cogging payload joint-coupling backlash external-push parameter
 contact-friction contact-restitution engine-setting input-gain input-offset input-dead-zone input-saturation
-wheel-slip input-nonlinearity input-hysteresis input-delay input-lag input-rate-limit input-rate-limited-lag
+wheel-slip side-slip input-nonlinearity input-hysteresis input-delay input-lag input-rate-limit input-rate-limited-lag
 supply-sag sensor-bias sensor-scale sensor-delay sensor-quantisation
 """
 ORDER = tuple(_ORDER.split())

@@ -57,13 +57,21 @@ PAIR: Mapping[str, Any] = {
     "integrator": "rk4",
     "period": "10 ms",
 }
+BASE: Mapping[str, Any] = {
+    "kind": "equations",
+    "states": {"x": "m", "y": "m", "theta": "rad"},
+    "inputs": {"v": "m/s", "w": "rad/s"},
+    "derivative": {"x": "v*cos(theta)", "y": "v*sin(theta)", "theta": "w"},
+    "integrator": "rk4",
+    "period": "10 ms",
+}
 
 
 class EffectContract(ABC):
     """Subclass in a test module as `Test…` and supply `effect`: pytest then runs every `test_…` below on it.
 
     Override `models` where the effect needs other sites than those of a rod under torque, a first-order lag, a rod that can
-    carry something, a cart, and two coupled joints: of these it is tried on the first two where it applies.
+    carry something, a cart, two coupled joints, and a base on wheels: of these it is tried on the first two where it applies.
     """
 
     seconds = 5.0
@@ -75,7 +83,7 @@ class EffectContract(ABC):
 
     def models(self) -> tuple[Model, ...]:
         """The models that it is tried on."""
-        return tuple(map(equations, (ROD, PLAIN, CARRIER, CART, PAIR)))
+        return tuple(map(equations, (ROD, PLAIN, CARRIER, CART, PAIR, BASE)))
 
     def test_name_is_kebab_case(self) -> None:
         e = self.effect()

@@ -13,7 +13,7 @@ from gapcert.plugin import Array, EffectParameter, Extension, Memory
 from gapcert_effects.thresholds import THRESHOLDS
 
 from .experiments import BOTH_WAYS, FREE_DECAY, LEVELS, PLACES, REVERSALS, SHAKE_AND_HOLD, SMALL_AND_LARGE, VARY_SPEED
-from .law import NEVER, Law, carries, driven, linked, moves, neighbour, placed, spread, straight, tilts
+from .law import NEVER, Law, carries, driven, linked, moves, neighbour, placed, spread, straight, tilts, wheels
 
 
 @final
@@ -246,6 +246,51 @@ class WheelSlip(Law):
 
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         return [(t * scales["force_peak"],) for t in spread(0.05, 3.0, 10)]
+
+
+class _Slip(Law):
+    """A base that rolls along its heading also moves sideways, by `sideways` of its speed `{v}` and rate of turning `{w}`."""
+
+    name = "side-slip"
+    sideways: ClassVar[str]
+    where = (wheels,)
+    signature = "paths are right while the base drives straight, and bend too much or too little in turns"
+    experiment = "drive circles of several radii at several speeds, in both directions"
+    family = "slip"
+
+    def extension(self, site: str, model: gc.Model) -> Extension:
+        (number,), rates = self.named(site, model), model.text()["derivative"]
+        y, heading = wheels(site, model) or (site, site)
+        ahead = f"(({rates[site]})*cos({heading}) + ({rates[y]})*sin({heading}))"
+        aside = self.sideways.format(number=number.name, v=ahead, w=f"({rates[heading]})")
+        forces = {site: f"-({aside})*sin({heading})", y: f"({aside})*cos({heading})"}
+        return Extension(self.name, site, (number,), forces=forces)
+
+
+@final
+class ShiftedAxle(_Slip):
+    """Sideways d·ω: the point that the log follows lies d ahead of the axle about which the base turns."""
+
+    name = "side-slip-of-a-shifted-axle"
+    variant_of = "side-slip"
+    parameters = (EffectParameter("ahead", {"velocity": 1}, (-0.02, 0.02), -1.0, 1.0),)
+    equation = "sideways speed ahead·ω"
+    sideways = "{number}*{w}"
+    amplitude = "ahead"
+
+
+@final
+class SideSlip(_Slip):
+    """Sideways −c·v·|v|·ω: tyres slip by an angle in proportion to the acceleration across them, v·ω."""
+
+    parameters = (
+        EffectParameter("compliance", {"force": -1, "time": 1}, (-0.1, 0.1), -3.0, 3.0, plausible=(0.0, float("inf"))),
+    )
+    equation = "sideways speed −compliance·v·|v|·ω"
+    sideways = "-{number}*{v}*abs({v})*{w}"
+    amplitude = "compliance"
+    variants = (ShiftedAxle,)
+    rivals: ClassVar = {"input-gain": LEVELS, "sensor-bias": PLACES}
 
 
 @final

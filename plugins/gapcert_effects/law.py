@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Callable, Mapping
@@ -121,6 +122,37 @@ def _weighs(site: str, model: gc.Model) -> bool:
 def carries(site: str, model: gc.Model) -> bool:
     """Has the coordinate a `points` entry, where a payload would sit?"""
     return site in _section(model, "points")
+
+
+def wheels(site: str, model: gc.Model) -> tuple[str, str] | None:
+    """(y, θ), where x is the site of a base that rolls along its heading: ẋ = v cos θ, ẏ = v sin θ.
+
+    Turning the heading turns every step, and steps point along the chord of the heading's arc.
+    """
+    rates, units = _section(model, "derivative"), {s.name: s.unit for s in model.states}
+    if site not in rates or not straight(site, model):
+        return None
+    for y, heading in itertools.permutations(rates, 2):
+        turns = heading in _words(str(rates[site])) & _words(str(rates[y]))
+        if turns and site not in (y, heading) and units[y] == units[site] and units[heading] == "rad":
+            names = list(units)
+            if _rolls(model, names.index(site), names.index(y), names.index(heading)):
+                return y, heading
+    return None
+
+
+def _rolls(model: gc.Model, x: int, y: int, heading: int) -> bool:
+    rng, n = np.random.default_rng(0), THRESHOLDS.rolling_points
+    before, u = rng.uniform(-1, 1, (n, model.nx)), rng.uniform(-1, 1, (n, model.nu))
+    straight = before * (np.arange(model.nx) != heading)
+    try:
+        moved, plain = (model.step(a, u).x - a for a in (before, straight))
+    except gc.GapcertError:
+        return False
+    way, ahead = (d[:, x] + 1j * d[:, y] for d in (moved, plain))
+    arc, beside = moved[:, heading], np.abs(np.sin(np.angle(ahead) - 0.5 * moved[:, heading]))
+    along = bool(np.all(beside <= THRESHOLDS.rolling_aside * np.abs(arc) + 1e-9))
+    return along and bool(np.any(way)) and np.allclose(way, ahead * np.exp(1j * before[:, heading]), rtol=1e-6, atol=1e-12)
 
 
 def neighbour(site: str, model: gc.Model) -> str | None:

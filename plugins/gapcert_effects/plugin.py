@@ -24,6 +24,7 @@ HOMES = {
         "cogging": "a force that repeats itself along the way",
         "backlash": "play between the drive and the coordinate",
         "wheel-slip": "a driving force that the ground takes only up to its traction",
+        "side-slip": "a base on wheels that moves sideways in turns",
         "external-push": "one push from outside",
     },
     "parameters": {

@@ -19,6 +19,10 @@ class Thresholds:
     outstanding: int = chosen(2, "periods that data suggest, at most: one may be a harmonic of the other")
     little_used: float = chosen(0.02, "of an input's peak: a side of its range, or a range, that is no longer has no knots")
     knots: int = chosen(7, "of a curve drawn through the data: three on either side of zero")
+    rolling_points: int = chosen(16, "states drawn, at which a step of a base on wheels must turn with its heading")
+    rolling_aside: float = chosen(
+        0.1, "of the angle turned in a step: from the chord of the arc, where the speed changes meanwhile"
+    )
     push_starts: int = chosen(80, "tried: the width of a push grows with the length of the recording")
     latest_input: float = chosen(0.1, "of the duration of the data, that an input comes late at most")
     latest_periods: float = chosen(1000.0, "of delay, at most: each is a hidden state")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import gapcert as gc
-from gapcert_diagnosis.testing import CARRIER, CART, PAIR, PLAIN, ROD, equations
+from gapcert_diagnosis.testing import BASE, CARRIER, CART, PAIR, PLAIN, ROD, equations
 
 FREE = {  # q' = u shows what reaches the model, and nothing else
     "kind": "equations",
@@ -398,6 +398,10 @@ APPLIES = [
     ("gravity-tilt", {**PAIR, "bias": {"p": "k/2*sin(p)"}}, {"p"}),
     ("wheel-slip", CART, {"q"}),
     ("wheel-slip", ROD, set()),
+    ("side-slip", BASE, {"x"}),
+    ("side-slip", {**BASE, "derivative": {**BASE["derivative"], "y": "v*sin(theta) + v/2"}}, set()),
+    ("side-slip", {**BASE, "derivative": {**BASE["derivative"], "y": "-v*sin(theta)"}}, set()),
+    ("side-slip", PLAIN, set()),
     ("backlash", {**PAIR, "forces": {"q": "u"}, "inputs": {"u": "N*m"}}, {"q"}),
     ("backlash", PLAIN, set()),
     ("load-dependent-friction", {**PAIR, "forces": {"q": "u"}, "inputs": {"u": "N*m"}}, {"q"}),
