@@ -13,7 +13,7 @@ from gapcert.plugin import Array, Model, Recording, UsageError, difference, magn
 
 from .data.dataset import Dataset, Windows, flat
 from .fitting.fit import Fit, fit, nearby
-from .fitting.hypothesis import between
+from .fitting.hypothesis import between, memories, shows_memory
 from .results import Experiment
 from .search.candidates import Causes
 from .thresholds import THRESHOLDS
@@ -221,7 +221,13 @@ def _played(fitted: Fit, u: Array, measured: Dataset) -> Array:
     x0 = np.tile(measured.states[0][0], (n, 1))
     with np.errstate(all="ignore"):
         x = h.model.fast_rollout(x0, fine, parameters=values or None).x[:, :-1:repeat]
-        y = h.model.output(flat(x), flat(u))[:, measured.columns].reshape(n, u.shape[1], -1)
+        past = np.floor(np.arange(u.shape[1])[:, None] - h.model.input_delays(values or None) / measured.period + 1e-6)
+        sent, known = np.take_along_axis(u, np.maximum(past, 0).astype(np.intp)[None], axis=1), None
+        if shows_memory(h.model):
+            begun = np.tile(h.model.hidden_default, (n, 1))
+            known = flat(memories(h.model, x, fine[:, : (u.shape[1] - 1) * repeat], values, begun, repeat))
+        shown = h.model.output(flat(x), flat(sent), values or None, known)
+        y = shown[:, measured.columns].reshape(n, u.shape[1], -1)
         late = h.model.output_delays(values or None)[..., measured.columns] / measured.period
         ahead = np.maximum(-late, -np.arange(u.shape[1])[:, None])
         return between(y[None], ahead)[0] if late.any() else y

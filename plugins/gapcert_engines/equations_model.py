@@ -153,6 +153,7 @@ class EngineModel(Model):
     curvature_enclosure: Any = partialmethod(_asked, "curvature_enclosure")
     output: Any = partialmethod(_asked, "output")
     output_delays: Any = partialmethod(_asked, "output_delays")
+    input_delays: Any = partialmethod(_asked, "input_delays")
     resolution: Any = partialmethod(_asked, "resolution")
     rounding_over: Any = partialmethod(_asked, "rounding_over")
     rounding_terms: Any = partialmethod(_asked, "rounding_terms")

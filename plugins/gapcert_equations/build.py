@@ -17,7 +17,7 @@ from .mechanics.dynamics import Dynamics
 from .programs.arithmetic import INTERVAL
 from .programs.tape import Recorder, Tape
 from .text import declarations, units
-from .text.grammar import ExpressionError, parse
+from .text.grammar import ExpressionError, names, parse
 from .text.sympy_text import expression, symbol
 from .text.units import SECOND, Checker
 
@@ -54,6 +54,7 @@ class Definition:
     output: Tape | None
     delays: Delays | None
     output_delays: Delays | None
+    shown: tuple[bool, ...]
 
 
 def refuse(problems: Sequence[Problem]) -> None:
@@ -82,7 +83,7 @@ def define(config: EquationsConfig, base: Definition | None = None) -> Definitio
         return _stepped(config, same, parameters, period)
     text = _Reader(config, [*states, *inputs, *config.memory], recorder)
     outputs, late, seen = _outputs(config, states, inputs), config.input_delay, config.output_delay
-    names = [y.name for y in outputs]
+    shown = [y.name for y in outputs]
     out = text.recorder.defined[texts] = Definition(
         config=config,
         texts=texts,
@@ -98,7 +99,8 @@ def define(config: EquationsConfig, base: Definition | None = None) -> Definitio
         start=tuple(_start(m) for m in config.memory.values()),
         output=text.tape(_output_texts(config)) if config.outputs else None,
         delays=_delays(config, _delay_tape(text, "input_delay", late), parameters, period) if late else None,
-        output_delays=Delays(_delay_tape(text, "output_delay", seen), tuple(map(names.index, seen))) if seen else None,
+        output_delays=Delays(_delay_tape(text, "output_delay", seen), tuple(map(shown.index, seen))) if seen else None,
+        shown=_shown(config),
     )
     return out
 
@@ -227,15 +229,23 @@ def _outputs(config: EquationsConfig, states: Mapping[str, Axis], inputs: Mappin
     columns = {**states, **inputs}
     if not config.outputs:
         return specs(states)
-    names = {n: units.unit(a.unit)[0] for n, a in columns.items()}
-    names |= {n: declarations.parameter_dimension(p) for n, p in config.parameters.items()}
+    known = {n: units.unit(a.unit)[0] for n, a in columns.items()}
+    known |= {n: declarations.parameter_dimension(p) for n, p in config.parameters.items()}
+    known |= {n: units.unit(m.unit)[0] for n, m in config.memory.items()} | {declarations.substep(config): SECOND}
     out = []
     for y, given in config.outputs.items():
         o = given if isinstance(given, OutputConfig) else OutputConfig(expr=given)
         shown = columns.get(o.expr.strip())
-        unit = shown.unit if shown else units.base_text(Checker(names, {}).infer(parse(o.expr)) or {})
+        unit = shown.unit if shown else units.base_text(Checker(known, {}).infer(parse(o.expr)) or {})
         out.append(StateSpec(y, o.unit or unit, o.kind or (shown.kind if shown else "real")))
     return tuple(out)
+
+
+def _shown(config: EquationsConfig) -> tuple[bool, ...]:
+    """Per input, is what outputs show of it what acts? Not where one of them reports it."""
+    texts, through = _output_texts(config), {f"outputs.{y}" for y in declarations.shown(config)}
+    held = [{n for y, t in texts.items() if (y in through) == acts for n, _ in names(parse(t))} for acts in (True, False)]
+    return tuple(u in held[0] and u not in held[1] for u in config.inputs)
 
 
 def _delay_tape(text: _Reader, section: str, delays: Mapping[str, str]) -> Tape:

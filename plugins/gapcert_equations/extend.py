@@ -5,11 +5,12 @@ from __future__ import annotations
 import ast
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from gapcert import Parameter, UsageError
 from gapcert.plugin import Extension
+from gapcert_equations.thresholds import THRESHOLDS
 
 from .config import EquationsConfig, MemoryConfig, OutputConfig, ParameterConfig
 from .text import declarations
@@ -23,14 +24,17 @@ _PLACEHOLDER = re.compile(r"\{\w*\}")
 
 def extended(config: EquationsConfig, extensions: Sequence[Extension]) -> EquationsConfig:
     """The config with each effect added in turn."""
+    through = declarations.shown(config)
     for e in extensions:
-        config = _add(config, e)
+        config = _add(config, e, through)
     return config
 
 
-def _add(config: EquationsConfig, e: Extension) -> EquationsConfig:
+def _add(config: EquationsConfig, e: Extension, through: Sequence[str]) -> EquationsConfig:
+    """through: outputs that show inputs through the plant."""
     where = f"effect '{e.effect}' at '{e.site}'"
     _names_are_free(config, e, where)
+    instant = e.input and _written(config, _replaced(e, input=_instant(e.input)), where)[0].input
     e, clock = _written(config, e, where)
     changes: dict[str, Any] = {"parameters": {**config.parameters, **{p.name: _stated(p) for p in e.parameters}}}
     forces = {site: text for site, text in {e.site: e.force, **e.forces}.items() if text is not None}
@@ -48,8 +52,8 @@ def _add(config: EquationsConfig, e: Extension) -> EquationsConfig:
     if e.output is not None:
         changes["outputs"] = _outputs(config, e)
     new = config.model_copy(update=changes)
-    if e.input is not None:
-        new = _everywhere(new, {e.site: e.input})
+    if e.input is not None and instant is not None:
+        new = _everywhere(new, {e.site: e.input}, {e.site: instant}, through)
     # Its own memory sees the input as it was commanded, so it comes after the replacement.
     memory = {m.name: MemoryConfig(unit=m.unit, next=m.next, start=m.start) for m in e.memory}
     return new.model_copy(update={"memory": {**new.memory, **memory, **clock}}) if memory or clock else new
@@ -86,6 +90,11 @@ def _written(config: EquationsConfig, e: Extension, where: str) -> tuple[Extensi
             raise UsageError(f"{where}: the model has a 'time' of its own, which the clock of effects needs; rename it")
         clock = {"time": MemoryConfig(unit="s", next=f"time + {declarations.substep(config)}")}
     return _replaced(e, **filled), clock
+
+
+def _instant(text: str | None) -> str | None:
+    """What acts when a sample is taken, of what acts on average over a sub-step: the average over next to nothing."""
+    return text and text.replace("{h}", f"({THRESHOLDS.instant!r}*{{h}})")
 
 
 def _replaced(data: Any, **changes: Any) -> Any:
@@ -165,12 +174,15 @@ def _stated(p: Parameter) -> ParameterConfig:
 
 def _outputs(config: EquationsConfig, e: Extension) -> dict[str, str | OutputConfig]:
     outputs: dict[str, str | OutputConfig] = dict(config.outputs) or {x: x for x in declarations.states(config)}
-    old, new = outputs[e.site], e.output or ""
-    return outputs | {e.site: old.model_copy(update={"expr": new}) if isinstance(old, OutputConfig) else new}
+    return outputs | {e.site: _output(outputs[e.site], lambda _: e.output or "")}
 
 
-def _everywhere(config: EquationsConfig, replacement: Texts) -> EquationsConfig:
-    """An input replaced in every expression of the dynamics; the outputs show what was commanded."""
+def _output(old: str | OutputConfig, new: Callable[[str], str]) -> str | OutputConfig:
+    return new(old) if isinstance(old, str) else old.model_copy(update={"expr": new(old.expr)})
+
+
+def _everywhere(config: EquationsConfig, replacement: Texts, instant: Texts, through: Sequence[str]) -> EquationsConfig:
+    """An input replaced in every expression of the dynamics, and in outputs that show what acts at an instant."""
 
     def texts(section: Mapping[str, str] | None) -> Texts | None:
         return None if section is None else {k: substitute(t, replacement) for k, t in section.items()}
@@ -178,4 +190,5 @@ def _everywhere(config: EquationsConfig, replacement: Texts) -> EquationsConfig:
     sections = {k: texts(getattr(config, k)) for k in ("derivative", "next", "bias", "forces", "dry_friction", "implicit")}
     matrix = None if config.mass_matrix is None else [[substitute(t, replacement) for t in row] for row in config.mass_matrix]
     memory = {z: m.model_copy(update={"next": substitute(m.next, replacement)}) for z, m in config.memory.items()}
-    return config.model_copy(update={**sections, "mass_matrix": matrix, "memory": memory})
+    seen = {y: _output(o, lambda t: substitute(t, instant)) if y in through else o for y, o in config.outputs.items()}
+    return config.model_copy(update={**sections, "mass_matrix": matrix, "memory": memory, "outputs": seen})

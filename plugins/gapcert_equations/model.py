@@ -233,16 +233,25 @@ class EquationsModel(Model):
         with np.errstate(all="ignore"):
             return rounded(self.definition.dynamics, parameters, columns[: self.nx], acting, known)
 
-    def output(self, x: Array, u: Array, parameters: Values | None = None) -> Array:
-        """`outputs` of the section; by default the state. parameters: a number each, or one per row."""
+    def output(self, x: Array, u: Array, parameters: Values | None = None, hidden: Array | None = None) -> Array:
+        """`outputs` of the section; by default the state. parameters: a number each, or one per row; hidden: default zero."""
         tape = self.definition.output
         if tape is None:
             return x
         with np.errstate(all="ignore"):
             known = [*self._values(parameters), self.definition.dynamics.substep(ARRAY)]
-            unseen = [np.float64(0)] * len(self.definition.memory)
-            values = tape.run(ARRAY, tape.prepare(ARRAY, known), [*_split(np.concatenate([x, u], axis=1)), *unseen])
+            count = len(self.definition.memory)
+            seen = [np.float64(0)] * count if hidden is None else _split(hidden)[len(self.hidden) - count :]
+            values = tape.run(ARRAY, tape.prepare(ARRAY, known), [*_split(np.concatenate([x, u], axis=1)), *seen])
         return _stacked([0.0 if v is None else v for v in values], len(x))
+
+    def input_delays(self, parameters: Values | None = None) -> Array:
+        """Of inputs that outputs show through what they drive; an output that reports a command is not late."""
+        late = self.late(self._values(parameters)) if any(self.definition.shown) else []
+        out = np.zeros((*np.broadcast_shapes(*(np.shape(d) for _, _, d in late)), self.nu))
+        for i, _, periods in late:
+            out[..., i] = periods * self.period if self.definition.shown[i] else 0.0
+        return out
 
     def output_delays(self, parameters: Values | None = None) -> Array:
         """Seconds by which each output shows the past, at the given values of parameters: (ny,), or (n, ny)."""

@@ -14,6 +14,7 @@ class Thresholds:
     # the package itself
     delays: int = chosen(10_000, "of an input, at most: each is a state")
     whole_ratio: float = chosen(1e-9, "relative: ratios of periods that were stated as whole differ by rounding alone")
+    instant: float = chosen(1e-6, "of a sub-step: over it nothing arrives, and differences still have half of their digits")
     # mechanics
     expanded_operations: int = chosen(100, "of a text up to which it is expanded")
     # text

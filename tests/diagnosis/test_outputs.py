@@ -120,3 +120,45 @@ def test_an_output_alone_whose_state_nothing_shows_is_answered():
     found = gc.diagnose(model, Recording((Trajectory(T, {"F": noisy, "v": v}, "log"),), {}, "zero"))
     assert found.verdict == "unexplained"
     assert np.isfinite([m.after for m in found.residual.values()]).all()
+
+
+def path(rng, kind):
+    """(input, what acts of it, at the instants of its samples): held between them, from rest."""
+    u = np.zeros(N)
+    u[20:] = (rng.uniform(0.4, 1.0, N // 30) * rng.choice([-1, 1], N // 30)).repeat(30)[: N - 20]
+    if kind == "input-saturation":
+        return u, np.clip(u, -0.7, 0.7), {"level": 0.7}
+    if kind == "input-dead-zone":
+        return u, u - np.clip(u, -0.25, 0.25), {"width": 0.25}
+    if kind == "input-delay":
+        return u, np.concatenate([np.zeros(3), u[:-3]]), {"delay": 3 * H}
+    return u, np.array(list(held(lambda y, a: a + (y - a) * np.exp(-H / 0.06), u))), {"time_constant": 0.06}
+
+
+@pytest.mark.parametrize("kind", ["input-saturation", "input-dead-zone", "input-delay", "input-lag"])
+def test_what_happens_to_an_input_reaches_the_outputs_it_drives(kind):
+    """An accelerometer on a damped mass: it shows the effort that acts, beside a log of the command."""
+    rng = np.random.default_rng(4)
+    data = {
+        "states": {"v": "m/s"},
+        "inputs": {"u": "N"},
+        "parameters": {"m": {"value": "0.4 kg", "tolerance": "3 %"}, "d": {"value": "0.8 N*s/m", "tolerance": "3 %"}},
+        "derivative": {"v": "(u - d*v)/m"},
+        "outputs": {"a": "(u - d*v)/m"},
+    }
+    u, acts, numbers = path(rng, kind)
+    fine = acts.repeat(200)
+    if kind == "input-lag":
+        t, at = np.arange(len(fine)) % 200 * H / 200, u.repeat(200)
+        fine = at + (fine - at) * np.exp(-t / 0.06)
+    step = H / 200
+    v = lfilter([0, step / 0.4], [1, step * 0.8 / 0.4 - 1], fine)[::200]
+    a = (acts - 0.8 * v) / 0.4
+    config = gc.registry().config("model", "equations").model_validate({"kind": "equations", "period": f"{H} s", **data})
+    model = gc.registry().build("model", "equations", config, gc.Context(None))
+    shown = a + 0.01 * a.std() * rng.normal(size=N)
+    found = gc.diagnose(model, Recording((Trajectory(T, {"a": shown, "u": u}, "log"),), {}, "zero"))
+    (cause,) = found.causes
+    assert cause.effect == kind or {cause.effect, kind} == {"input-delay", "sensor-delay"}
+    for name, value in numbers.items():
+        assert cause.parameters[name].value == pytest.approx(value, rel=0.03)

@@ -156,3 +156,20 @@ def test_effects_that_do_not_fit(extension, words):
         build(MECHANICAL).extend([extension])
     with pytest.raises(gc.UsageError, match="unknown kind"):
         build(MECHANICAL).sites("engine")
+
+
+def test_outputs_show_what_reaches_the_plant_and_logs_what_was_commanded():
+    top, tau, late = gc.Parameter("top", 1.0, "N*m"), gc.Parameter("tau", 0.1, "s"), gc.Parameter("late", 0.015, "s", high=0.05)
+    spec = PLAIN | {"outputs": {"alpha": "torque/J", "asked": "-2*torque"}}
+    x, u = np.zeros((1, 2)), np.array([[4.0]])
+    cut = build(spec).extend([effect("torque", top, input="min({u}, top)")])
+    assert cut.to_spec()["outputs"] == {"alpha": "(min(torque, top))/J", "asked": "-2*torque"}
+    assert cut.output(x, u).tolist() == [[0.5, -8.0]]
+    z = gc.plugin.Memory("slow", "N*m", "slow + {h}/tau*({u} - slow)")
+    lag = build(spec).extend([effect("torque", tau, input="slow + {h}/tau*({u} - slow)/2", memory=(z,))])
+    same(lag, lag.to_spec())
+    # At the instant of a sample nothing of the coming sub-step has arrived.
+    np.testing.assert_allclose(lag.output(x, u, None, np.array([[3.0]])), [[1.5, -8.0]], rtol=1e-6)
+    assert build(spec).extend([effect("torque", late, delay="late")]).input_delays().tolist() == [0.0]
+    del spec["outputs"]["asked"]
+    assert build(spec).extend([effect("torque", late, delay="late")]).input_delays().tolist() == [0.015]

@@ -225,8 +225,8 @@ class RelativeModel(_Relative, Model):
             return None
         return np.asarray(own + (self.inner.jacobian_enclosure(near).mag @ missed[..., None])[..., 0])
 
-    def output(self, x: Array, u: Array, parameters: Mapping[str, Array | float] | None = None) -> Array:
-        return self.inner.output(x, self.relative.inputs(x, u), parameters)
+    def output(self, x: Array, u: Array, parameters: Any = None, hidden: Array | None = None) -> Array:
+        return self.inner.output(x, self.relative.inputs(x, u), parameters, hidden)
 
     def extend(self, extensions: Sequence[Extension]) -> Model:
         return RelativeModel(self.inner.extend(extensions), self.relative)

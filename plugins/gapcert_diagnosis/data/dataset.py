@@ -11,7 +11,7 @@ from typing import Any, TypeVar, final
 import numpy as np
 import numpy.typing as npt
 
-from gapcert.plugin import Array, Hold, Model, Recording, StateSpec, UsageError
+from gapcert.plugin import Array, Hold, Model, Recording, StateSpec, UsageError, difference
 from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_recordings import JITTER, Log, Piece, pieces
 
@@ -78,6 +78,8 @@ class Dataset:
             raise UsageError(f"recording: '{channels[still[0]].name}' never changes; record a motion, or leave the channel out")
         sizes, noise = np.array([len(p.t) for p in kept]), np.array([p.noise for p in kept])
         floor = np.sqrt(np.average(np.nan_to_num(noise) ** 2, 0, sizes))
+        states = tuple(_states(model, channels, p) for p in kept)
+        floor = _beneath(model, columns, kept, states, floor, repeat)
         floor = np.array([recording.noise.get(c.name, e) for c, e in zip(channels, floor, strict=True)])
         return cls(
             channels,
@@ -87,7 +89,7 @@ class Dataset:
             tuple(p.t for p in kept),
             tuple(p.y for p in kept),
             tuple(p.means(1, "zero") for p in kept),
-            tuple(_states(model, channels, p) for p in kept),
+            states,
             # Data without noise would otherwise ask the model for more digits than any integrator has.
             np.maximum(floor, THRESHOLDS.least_floor * spread),
             spread,
@@ -368,6 +370,47 @@ def _states(model: Model, channels: tuple[StateSpec, ...], piece: Piece) -> Arra
         if place in at and speed not in at:
             x[:, j] = piece.slope[:, at[place]]
     return x
+
+
+def at_once(model: Model, x: Array, u: Array, change: Array, repeat: int) -> Array:
+    """What a change (nu,) of the inputs moves of the outputs (n, ny) within a sample of `repeat` model steps."""
+    on = u + change
+    direct = difference(model.outputs, model.output(x, on), model.output(x, u))
+    for _ in range(repeat):
+        new, x = model.step(x, on).x, model.step(x, u).x
+    held = difference(model.outputs, model.output(new, u), model.output(x, u))
+    return np.maximum(np.abs(direct), np.abs(held))
+
+
+def _beneath(
+    model: Model, columns: tuple[int, ...], kept: Sequence[Piece], states: Sequence[Array], floor: Array, repeat: int
+) -> Array:
+    """Noise floors (ny,): where inputs make channels jump, no more than what varies in half of their samples.
+
+    Of a channel that shows an input at once, what the model says of that is taken away first.
+    """
+    u, found, jumps = [p.means(1, "zero") for p in kept], floor.copy(), np.zeros(len(columns))
+    few = slice(None, None, max(1, sum(map(len, u)) // THRESHOLDS.jumping_samples))
+    at, sent = np.concatenate(states)[few], np.concatenate(u)[few]
+    for i, most in enumerate(np.max([np.abs(np.diff(a, axis=0)).max(axis=0, initial=0.0) for a in u], axis=0).tolist()):
+        moved = at_once(model, at, sent, most * (np.arange(model.nu) == i), repeat)[:, columns]
+        jumps = np.fmax(jumps, moved.max(axis=0))
+    shown = [model.output(x, a)[:, columns] for x, a in zip(states, u, strict=True)]
+    rows = [np.where(p.weight > 0, p.y, np.nan) for p in kept]
+    for c in np.flatnonzero(jumps > floor).tolist():
+        left = [y[:, c] - s[:, c] for y, s in zip(rows, shown, strict=True)]
+        least = min(scatter([y[:, c] for y in rows]), scatter(left))
+        found[c] = least if 0 < least < THRESHOLDS.jumping_floor * floor[c] else floor[c]
+    return found
+
+
+def scatter(rows: Sequence[Array]) -> float:
+    """σ of white noise beneath signals (T,): the median of |k-th differences| is 0.6745 √C(2k, k) σ; NaN takes no part."""
+    found = []
+    for k in (2, 3, 4):
+        apart = np.concatenate([np.abs(np.diff(y, k)) for y in rows])
+        found.append(float(np.nanmedian(apart)) / math.sqrt(math.comb(2 * k, k)) if np.isfinite(apart).any() else math.inf)
+    return min(found) / 0.6745
 
 
 def _driven(model: Model) -> list[tuple[int, int]]:

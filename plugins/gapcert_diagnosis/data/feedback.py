@@ -7,10 +7,10 @@ from typing import final
 
 import numpy as np
 
-from gapcert.plugin import Array, Bools, Model, difference
+from gapcert.plugin import Array, Bools, Model
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
-from .dataset import Dataset
+from .dataset import Dataset, at_once
 
 
 @final
@@ -91,12 +91,8 @@ def _at_once(model: Model, m: Dataset, i: int) -> list[int]:
     """Per channel 1 where a sudden change of the input shows within the same sample, else 0."""
     x, u = (np.concatenate(a)[:: max(1, sum(map(len, m.inputs)) // 200)] for a in (m.states, m.inputs))
     sudden = float(np.sqrt(np.mean(np.concatenate([np.diff(a[:, i]) for a in m.inputs]) ** 2)))
-    on = u + sudden * (np.arange(model.nu) == i)
-    direct = difference(model.outputs, model.output(x, on), model.output(x, u))
-    for _ in range(m.repeat):
-        new, x = model.step(x, on).x, model.step(x, u).x
-    held = difference(model.outputs, model.output(new, u), model.output(x, u))
-    moved = np.sqrt(np.mean(np.maximum(np.abs(direct), np.abs(held)) ** 2, axis=0))[list(m.columns)]
+    reached = at_once(model, x, u, sudden * (np.arange(model.nu) == i), m.repeat)
+    moved = np.sqrt(np.mean(reached**2, axis=0))[list(m.columns)]
     return [int(a > THRESHOLDS.same_motion * s) for a, s in zip(moved, m.sigma, strict=True)]
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.plugin import Array, Model, difference
-from gapcert_diagnosis.data.dataset import Dataset, Windows
+from gapcert_diagnosis.data.dataset import Dataset, Windows, flat
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 
@@ -58,12 +58,12 @@ class Hypothesis:
         """
         b, (w, length, _), m = len(theta), windows.y.shape, windows.measured
         with np.errstate(all="ignore"):
-            x = self.motion(windows, theta, start, every=m.repeat).reshape(b * w * length, -1)
-            shown, values = x, self._values(theta, w)
-            if not self._shows_states():
-                u = np.broadcast_to(windows.u[None, :, m.history :], (b, w, length, self.model.nu))
-                rows = {n: np.repeat(v, length) if np.ndim(v) else v for n, v in values.items()}
-                shown = self.model.output(x, u.reshape(b * w * length, -1), rows)
+            hidden, values = self._begun(windows, theta), self._values(theta, w)
+            x = self._moved(windows, theta, start, hidden, every=m.repeat)
+            if self._shows_states():
+                shown = x.reshape(b * w * length, -1)
+            else:
+                shown = seen(self.model, windows, x, values, hidden).reshape(b * w * length, -1)
             every = m.columns == tuple(range(shown.shape[1]))
             y = (shown if every else shown[:, m.columns]).reshape(b, w, length, -1)
             late = np.broadcast_to(self.model.output_delays(values), (b * w, len(self.model.outputs)))[:, m.columns]
@@ -74,7 +74,11 @@ class Hypothesis:
 
     def motion(self, windows: Windows, theta: Array, start: Array, every: int = 1) -> Array:
         """States (b·W, (L − 1)·repeat // every + 1, nx) at every `every`-th model step."""
-        b, w, m = len(theta), len(windows), windows.measured
+        return self._moved(windows, theta, start, self._begun(windows, theta), every)
+
+    def _begun(self, windows: Windows, theta: Array) -> Array | None:
+        """Hidden states (b·W, nh) where the windows begin."""
+        b, w = len(theta), len(windows)
         hidden = None if windows.memory is None else np.tile(windows.memory, (b, 1))
         if self.model.hidden and hidden is None:
             # Rows that differ in their starts alone have one past.
@@ -82,8 +86,12 @@ class Hypothesis:
             different = sorted(set(given))
             hidden = self.hidden(windows, np.array(different)).reshape(len(different), w, -1)
             hidden = hidden[[different.index(row) for row in given]].reshape(b * w, -1)
+        return hidden
+
+    def _moved(self, windows: Windows, theta: Array, start: Array, hidden: Array | None, every: int) -> Array:
+        w, m = len(windows), windows.measured
         u = windows.drive[:, m.past : m.past + (windows.length - 1) * m.repeat]
-        start = start.reshape(b * w, -1)
+        start = start.reshape(len(theta) * w, -1)
         return self.model.fast_rollout(start, u, parameters=self._values(theta, w), hidden=hidden, every=every).x
 
     def led(self, windows: Windows, theta: Array, start: Array, rows: npt.NDArray[np.bool_]) -> Windows:
@@ -150,6 +158,62 @@ def between(y: Array, ahead: Array) -> Array:
                 weight *= (inside - k) / (j - k)
         out += weight * np.take_along_axis(y, base + j, axis=2)
     return out
+
+
+def seen(
+    model: Model, windows: Windows, x: Array, values: Mapping[str, Array | float], hidden: Array | None, back: int = 0
+) -> Array:
+    """Outputs (n, K, ny) at K samples from `back` before each window on, of motions x (n, K, nx), W dividing n.
+
+    values: a number each, or one per motion; hidden (n, nh): at the first of these samples.
+    """
+    n, count, w, m = *x.shape[:2], len(windows), windows.measured
+    u: Array = windows.u[None, :, m.history - back :][:, :, :count]
+    if (late := model.input_delays(values)).any():
+        u = _arriving(windows, np.broadcast_to(late, (n, model.nu)).reshape(-1, w, model.nu), count, back)
+    rows = {k: np.repeat(v, count) if np.ndim(v) else v for k, v in values.items()}
+    known = None
+    if hidden is not None and shows_memory(model):
+        drive = windows.drive[:, m.past - back * m.repeat :][:, : (count - 1) * m.repeat]
+        known = flat(memories(model, x, drive, values, hidden, m.repeat))
+    u = np.broadcast_to(u, (n // w, *u.shape[1:]))
+    return model.output(flat(x), flat(u), rows, known).reshape(n, count, -1)
+
+
+def _arriving(windows: Windows, late: Array, count: int, back: int) -> Array:
+    """Inputs (b, W, count, nu) as they arrive `late` (b, W, nu) seconds after they were sent, as they are held."""
+    m, out = windows.measured, np.empty((*late.shape[:2], count, late.shape[2]))
+    for k, (piece, first) in enumerate(windows.place.tolist()):
+        at = first - back + np.arange(count) - late[:, k, :, None] / m.period
+        at = np.clip(at if m.hold == "first" else np.floor(at + THRESHOLDS.whole_sample), 0, None)
+        for j, sent in enumerate(m.inputs[piece].T):
+            out[:, k, :, j] = np.interp(at[:, j], np.arange(len(sent)), sent)
+    return out
+
+
+def shows_memory(model: Model) -> bool:
+    """Do outputs show what is remembered: are they unknown where it is?"""
+    x, u, unknown = (np.full((1, k), v) for k, v in ((model.nx, 0.0), (model.nu, 0.0), (len(model.hidden), np.nan)))
+    with np.errstate(all="ignore"):
+        return bool(model.hidden) and bool(np.isnan(model.output(x, u, None, unknown)).any())
+
+
+def memories(model: Model, x: Array, drive: Array, values: Mapping[str, Array | float], hidden: Array, repeat: int) -> Array:
+    """Hidden states (n, K, nh) at the samples of motions x (n, K, nx), from those at the first.
+
+    What an input leaves behind does not depend on the motion, which may therefore be any.
+    """
+    stops, path = np.arange(x.shape[1]) * repeat, np.full((*drive.shape[:2], x.shape[2]), np.nan)
+    if drive.shape[1] == 0:
+        return hidden[:, None]
+    path[:, 0] = x[: len(drive), 0]
+    if (found := model.fast_memories(path, drive, stops.tolist(), values, hidden)) is not None:
+        return found
+    out = [hidden]
+    for k, stop in enumerate(stops[:-1].tolist()):
+        step = model.fast_rollout(x[:, k], drive[:, stop : stop + repeat], parameters=values, hidden=out[-1], every=repeat)
+        out.append(out[-1] if step.hidden is None else step.hidden)
+    return np.stack(out, axis=1)
 
 
 def recalled(model: Model, windows: Windows, parameters: Mapping[str, Array | float], count: int) -> Array:

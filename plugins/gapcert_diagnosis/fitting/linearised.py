@@ -19,7 +19,7 @@ from gapcert_diagnosis.data.dataset import Windows, flat, once
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .fit import Fit
-from .hypothesis import nudges, recalled
+from .hypothesis import nudges, recalled, seen, shows_memory
 from .step_size import built
 
 
@@ -181,9 +181,9 @@ class Path:
     def output(self, model: Model, parameters: Mapping[str, float], moved: Array | float = 0.0) -> Array:
         """Measured channels (W, L, ny) of the path, late where the model says so."""
         m, count = self.windows.measured, self.samples.shape[1]
-        x = (self.samples + moved).reshape(-1, model.nx)
-        u = self.windows.u.reshape(len(x), model.nu)
-        y = model.output(x, u, parameters or None).reshape(len(self.windows), count, -1)
+        rows = {n: np.array([v]) for n, v in parameters.items()}
+        hidden = recalled(model, self.windows, rows, 1) if shows_memory(model) else None
+        y = seen(model, self.windows, self.samples + moved, parameters, hidden, m.history)
         late, at, out = model.output_delays(parameters or None) / m.period, np.arange(count), y.copy()
         for c in np.flatnonzero(late).tolist():
             for w in range(len(y)):

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from gapcert.plugin import Array, Model
+from gapcert_diagnosis.data.dataset import scatter
 from gapcert_diagnosis.fitting.fit import Fit, fit, lag_one, rescued
 from gapcert_diagnosis.fitting.linearised import Tangent
 from gapcert_diagnosis.results import Push, Unexplained, Verdict
@@ -126,15 +127,11 @@ def _loud(long: Tangent, short: Tangent) -> dict[int, float]:
     is no more than what varies from sample to sample in the residual, jumps aside.
     """
     rows, rough = [m.residual.reshape(m.windows.y.shape) for m in (short, long)], long.windows.measured.rough
-    floor = np.where(rough > 0 if rough.size else False, 1.0, np.fmin(_scatter(rows[1]), 1.0))
+    floor = np.where(
+        rough > 0 if rough.size else False, 1.0, np.fmin([scatter(list(c)) for c in rows[1].transpose(2, 0, 1)], 1.0)
+    )
     least = np.minimum(*(np.mean(r**2, axis=(0, 1)) for r in rows))
     return {c: float(v) for c, v in enumerate(least) if v > (THRESHOLDS.loud_channel * floor[c]) ** 2}
-
-
-def _scatter(rows: Array) -> Array:
-    """σ (ny,) of white noise beneath rows (W, L, ny): the median of |k-th differences| is 0.6745 √C(2k, k) σ."""
-    found = [np.median(np.abs(np.diff(rows, k, axis=1)), axis=(0, 1)) / math.sqrt(math.comb(2 * k, k)) for k in (2, 3, 4)]
-    return np.asarray(np.min(found, axis=0) / 0.6745)
 
 
 def _share(motion: Tangent, sites: tuple[str, ...], excess: float, channel: int | None = None) -> float:

@@ -84,17 +84,25 @@ class Library:
         """Of another model, or of other data."""
         return Library(model, measured or self.measured, effects, self.horizon, self.exact)
 
+    def shows(self, name: str) -> bool:
+        """Do measured channels show an input at once, whatever it drives?"""
+        at = [s.name for s in self.model.inputs].index(name)
+        return bool(np.any(self._direct(at)[:, list(self.measured.columns)]))
+
+    def _direct(self, i: int) -> Array:
+        """What a small change of an input adds to the outputs (n, ny), wherever the data are."""
+        rows = np.unique(np.linspace(0, len(self._path[0]) - 1, THRESHOLDS.swept_points).astype(np.intp))
+        (x, u), m = (a[rows] for a in self._path), self.model
+        near = u + THRESHOLDS.tangent_nudge * max(1.0, float(np.abs(u[:, i]).max())) * (np.arange(m.nu) == i)
+        return difference(m.outputs, m.output(x, near), m.output(x, u))
+
     @cached_property
     def idle(self) -> tuple[str, ...]:
         """Inputs that move no state and no output, wherever the data are."""
         rows = np.unique(np.linspace(0, len(self._path[0]) - 1, THRESHOLDS.swept_points).astype(np.intp))
-        (x, u), m, out = (a[rows] for a in self._path), self.model, list[str]()
+        (x, u), m = (a[rows] for a in self._path), self.model
         still = ~np.any(m.jacobian(x, u)[:, :, m.nx :], axis=(0, 1))
-        for i in np.flatnonzero(still).tolist():
-            near = u + THRESHOLDS.tangent_nudge * max(1.0, float(np.abs(u[:, i]).max())) * (np.arange(m.nu) == i)
-            if not np.any(difference(m.outputs, m.output(x, near), m.output(x, u))):
-                out.append(m.inputs[i].name)
-        return tuple(out)
+        return tuple(m.inputs[i].name for i in np.flatnonzero(still).tolist() if not np.any(self._direct(i)))
 
     def _possible(self, c: Candidate) -> bool:
         """Does the effect apply, can the data show it, and is there a tolerance that can be lifted?"""

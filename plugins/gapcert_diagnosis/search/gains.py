@@ -109,7 +109,7 @@ class GainTable:
 
     def enter(self, pushes: Sequence[Push]) -> None:
         """The columns of candidates, many in one pass; beside those that are there already."""
-        moving = [p for p in pushes if p.state is not None]
+        moving = [p for p in pushes if p.state is not None and p.output is None]
         # As many as stay near the processor: a pass goes through all of them at every step.
         ends = np.cumsum([0, *(len(p.values) for p in moving)]) // AT_ONCE
         for k in np.unique(ends[:-1]).tolist():
@@ -118,7 +118,7 @@ class GainTable:
         self.entered |= {p.candidate.key for p in pushes}
         for p in pushes:
             if p.output is not None:
-                self._split([p], self._rows(None, p.output))
+                self._split([p], self._rows(p.state, p.output))
 
     def _split(self, pushes: Sequence[Push], rows: Array) -> None:
         seen = np.swapaxes(self.motion.free, 1, 2) @ rows

@@ -74,7 +74,7 @@ class Screen:
             state = self._moved(self.library.shared(members[0]), given, int(ends[-1]), fine=fine)
             for c, rows, first in zip(members, values, ends, strict=False):
                 own = np.ascontiguousarray(state[..., first : first + len(rows)])
-                self._pushes[c.key] = Push(c, rows, own, None)
+                self._pushes[c.key] = Push(c, rows, own, self._fed(c, rows))
 
     def _moving(self, c: Candidate) -> bool:
         """Does a candidate change the next state, and not what is shown of it, or a stated number?"""
@@ -106,13 +106,22 @@ class Screen:
         names = self.library.names(c)
         if self.library.loosened(c) is not None:
             return Push(c, values, None, None)
-        model, channels = self.library.shared(c), self.windows.measured.channels
+        model = self.library.shared(c)
         if not self._moving(c):
-            shown = [self.path.output(model, dict(zip(names, row, strict=True))) for row in values.tolist()]
-            return Push(c, values, None, np.stack([difference(channels, y, self._shown(model)) for y in shown], axis=-1))
+            return Push(c, values, None, self._added(c, values))
         fine = bool(self.library.suggested(c))
         state = self._moved(model, dict(zip(names, values.T, strict=True)), len(values), fine=fine)
-        return Push(c, values, np.ascontiguousarray(state), None)
+        return Push(c, values, np.ascontiguousarray(state), self._fed(c, values))
+
+    def _fed(self, c: Candidate, values: Array) -> Array | None:
+        """What a change of an input adds to the channels at once, where they show that input."""
+        return self._added(c, values) if c.effect.site == "input" and self.library.shows(c.site) else None
+
+    def _added(self, c: Candidate, values: Array) -> Array:
+        """What values (g, p) add to the channels along the path, (W, L, ny, g)."""
+        model, names, channels = self.library.shared(c), self.library.names(c), self.windows.measured.channels
+        shown = [self.path.output(model, dict(zip(names, row, strict=True))) for row in values.tolist()]
+        return np.stack([difference(channels, y, self._shown(model)) for y in shown], axis=-1)
 
     def push_at(self, c: Candidate, values: Mapping[str, float]) -> Push:
         return self.pushed(c, np.array([[values[n] for n in self.library.names(c)]]))
@@ -134,7 +143,7 @@ class Screen:
         if (freed := library.freed(c)) is not None:
             return math.inf if abs(values[freed.name] - freed.value) > freed.tolerance else 0.0
         push = self.push_at(c, values)
-        if push.output is not None:
+        if push.output is not None and push.state is None:
             channel = [s.name for s in m.channels].index(c.site)
             return _most(push.output[:, :, channel]) / float(m.spread[channel])
         assert push.state is not None, "what frees no number moves the state or the output"

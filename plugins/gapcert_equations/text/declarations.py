@@ -7,8 +7,8 @@ from typing import Any
 
 from gapcert_equations.config import Axes, Axis, EquationsConfig, MemoryConfig, ParameterConfig, Problem, PythonConfig
 
-from . import units
-from .grammar import name_problem, near
+from . import grammar, units
+from .grammar import name_problem, near, parse
 from .units import NONE, SECOND, Dimension
 
 Path = tuple[str | int, ...]
@@ -58,6 +58,12 @@ def substep(config: EquationsConfig) -> str:
     while name in taken:
         name += "_"
     return name
+
+
+def shown(config: EquationsConfig) -> tuple[str, ...]:
+    """Outputs that show inputs through the plant: what of inputs and numbers alone is made reports what was commanded."""
+    texts = {y: o if isinstance(o, str) else o.expr for y, o in config.outputs.items()}
+    return tuple(y for y, text in texts.items() if {n for n, _ in grammar.names(parse(text))} - set(config.inputs))
 
 
 def parameter_dimension(value: float | str | ParameterConfig) -> Dimension:

@@ -215,11 +215,11 @@ class _Expressions:
             self.found.append((path, message, None))
         where = path if isinstance(self.config.outputs[str(path[-1])], str) else (*path, "expr")
         if output.unit is None:
-            self._infer(where, output.expr, self.measurable)
+            self._infer(where, output.expr)
         elif bad := declarations.unit_problems((*path, "unit"), output.unit):
             self.found += bad
         else:
-            self._expect(where, output.expr, units.unit(output.unit)[0], f"the unit of {path[-1]}", self.measurable)
+            self._expect(where, output.expr, units.unit(output.unit)[0], f"the unit of {path[-1]}")
 
     def _expect(self, path: Path, text: str, wanted: Dimension, what: str, known: Iterable[str] | None = None) -> None:
         if (path, text) not in self.known:

@@ -6,7 +6,7 @@ state of the comparison, over a declared range.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from functools import partialmethod
 from typing import Any, final
 
@@ -142,8 +142,8 @@ class AugmentedModel(Model):
         inner = self.model.curvature_enclosure(self._inner(z), axis if axis < nx else axis - len(self.added))
         return Interval.concatenate([inner, np.zeros((len(z), len(self.added)))], axis=1)
 
-    def output(self, x: Array, u: Array, parameters: Mapping[str, Array | float] | None = None) -> Array:
-        return self.model.output(self._own(x), u, parameters)
+    def output(self, x: Array, u: Array, parameters: Any = None, hidden: Array | None = None) -> Array:
+        return self.model.output(self._own(x), u, parameters, hidden)
 
     def resolution(self, magnitude: Array) -> Array:
         """h⁺ = h is exact."""

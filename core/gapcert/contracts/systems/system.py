@@ -413,17 +413,20 @@ class Model(System, Extendable, EngineHints):
         """Per state, the term whose rounding has the largest share in that bound, over all of the boxes."""
         return ("",) * self.nx
 
-    def output(self, x: Array, u: Array, parameters: Values | None = None) -> Array:
-        """y = h(x, u), shape (n, ny); by default the state itself."""
+    def output(self, x: Array, u: Array, parameters: Values | None = None, hidden: Array | None = None) -> Array:
+        """y = h(x, u, hidden), shape (n, ny), late inputs as they arrive; by default the state itself, and nothing hidden."""
         return x
+
+    def input_delays(self, parameters: Values | None = None) -> Array:
+        """Seconds by which what outputs show of each input is late, (nu,), or (n, nu)."""
+        return np.zeros(self.nu)
 
     def fast_rollout(
         self, x0: Array, u: Array, *, parameters: Values | None = None, hidden: Array | None = None, every: int = 1
     ) -> Step:
         """`rollout` within rounding: x (n, T // every + 1, nx) from x0 (n, nx), row i under u[i mod w] of u (w, T, nu).
 
-        w divides n. Override for speed. A row that blows up is not finite from there on, and disturbs no other.
-        """
+        w divides n. Override for speed. A row that blows up is not finite from there on, and disturbs no other."""
         u = np.tile(u, (len(x0) // len(u), 1, 1))
         try:
             result = self.rollout(x0, u, parameters=parameters, hidden=hidden)
@@ -449,8 +452,7 @@ class Model(System, Extendable, EngineHints):
     def along(self, x: Array, u: Array, *, parameters: Values | None = None, hidden: Array | None = None) -> Array:
         """One step from every state of given motions x (n, T, nx) under u (n, T, nu): x⁺ (n, T, nx), hidden state handed on.
 
-        Unlike a rollout, every step starts from the motion that is given. parameters: one per motion.
-        """
+        Unlike a rollout, every step starts from the motion that is given. parameters: one per motion."""
         n, steps, _ = x.shape
         if not self.hidden:
             rows = {k: np.repeat(np.broadcast_to(v, (n,)), steps) for k, v in (parameters or {}).items()} or None
@@ -464,15 +466,13 @@ class Model(System, Extendable, EngineHints):
     def fast_memories(self, path: Array, u: Array, stops: Sequence[int], parameters: Values, hidden: Array) -> Array | None:
         """Hidden states (n, stops, nh) before steps `stops` of motions under u (w, T, nu), from hidden (n, nh), w dividing n.
 
-        They go on from path (w, T, nx) where that is finite, else from where they are. None: there is nothing faster than
-        rollouts from one such step to the next.
+        They go on from path (w, T, nx) where that is finite, else from where they are. None: nothing is faster than rollouts.
         """
         return None
 
     def output_delays(self, parameters: Values | None = None) -> Array:
         """Seconds by which each output shows the past, (ny,), or (n, ny) for parameters (n,); `output` does not apply them."""
-        rows = np.broadcast_shapes(*(np.shape(v) for v in (parameters or {}).values()))
-        return np.zeros((*rows, len(self.outputs)))
+        return np.zeros((*np.broadcast_shapes(*(np.shape(v) for v in (parameters or {}).values())), len(self.outputs)))
 
 
 class Backend(System):
