@@ -227,7 +227,7 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
     lap("search")
 
     answer, judges = _judged(settled, windows, data.held, problem)
-    pushed = spared("list of pushes", (), _pushes, problem, data, answer)
+    pushed = spared("list of pushes", (), _pushes, problem, data, answer, spared.told)
     more = len(pushed) > sum(c.effect.name == PUSH for c in answer.causes)
     loud = bool((np.sqrt(answer.fit.chi) > THRESHOLDS.loud_channel).any())
     calm = spared("search between pushes", None, data.calm, problem, pushed) if more and loud else None
@@ -394,11 +394,12 @@ def _at(pushed: Sequence[Push], recording: Recording) -> list[tuple[int, float, 
     ]
 
 
-def _pushes(problem: DiagnosisProblem, data: Data, answer: Answer) -> tuple[Push, ...]:
-    """All along the recording, where more than noise is left without them; none where too little is whole to look in."""
+def _pushes(problem: DiagnosisProblem, data: Data, answer: Answer, told: list[str]) -> tuple[Push, ...]:
+    """All along the recording, where more than noise is left without them; none where that cannot be fitted, as is told."""
     try:
         return _listed(problem, data, answer)
-    except UsageError:
+    except UsageError as error:
+        told.append(f"pushes could not be looked for ({error}); the answer stands")
         return ()
 
 

@@ -39,6 +39,7 @@ class Thresholds:
     loop_windows: int = chosen(4, "of the widest motion, that a loop is drawn from")
     wide_interval: float = chosen(0.5, "widths of a picture's range beyond which an estimate says nothing")
     # data
+    most_repeats: int = chosen(10_000, "steps of a model per sample: as a rule the time is in another unit")
     input_history: float = decides(0.1, "s of input before a window that effects with memory look back on")
     uneven_period: float = chosen(0.05, "of the period, between the median of uneven steps and the model's")
     trembling: float = chosen(0.01, "of the period, by which half of all steps are off: such a clock is on no grid")
@@ -67,9 +68,15 @@ class Thresholds:
     loop_share: float = chosen(0.5, "of the changes of an input, that the state tells")
     loop_change: float = chosen(0.02, "s: over less, changes are noise, over more, what is commanded")
     loop_jump: float = chosen(8.0, "times the median change of an input: more is a command")
+    loop_step: float = chosen(3.0, "times the changes before and after: a command that is set anew, which no law follows")
     loop_rest: float = chosen(0.2, "of what is left without feedback: a law that leaves less is no chance")
     loop_samples: int = chosen(4000, "of one stretch, that are simulated without feedback: seconds, not minutes")
     loop_cutoff: float = chosen(1e-10, "relative singular value of regressors below which rounding tells them apart")
+    loop_switch: float = threshold(0.5, "of what is early without a loop: measured, 0.8 and more in 40 played inputs")
+    relay_levels: int = chosen(3, "of an input that a relay switches: on, off and back")
+    relay_switches: int = chosen(5, "per level at least: fewer come in order by chance")
+    relay_nearby: int = chosen(12, "switches between which a command may be set anew")
+    relay_cutoff: float = chosen(1e-3, "relative singular value of states: sums that move less are noise")
     # fitting
     blown_residual: float = chosen(1e6, "noise floors that a simulation which blew up is charged with, per sample")
     wildest_residual: float = threshold(1e100, "noise floors: beyond 1e154 a square is no float64; it has blown up long before")

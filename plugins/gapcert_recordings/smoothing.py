@@ -8,7 +8,7 @@ from typing import NamedTuple, final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import maximum_filter1d, median_filter
+from scipy.ndimage import convolve1d, maximum_filter1d, median_filter
 from scipy.signal import savgol_coeffs, savgol_filter
 
 from gapcert.plugin import Array, Bools
@@ -147,14 +147,17 @@ def _filter(y: Array, valid: Bools, period: float) -> tuple[int, int]:
     most = 1 + THRESHOLDS.smooth_bias + 1.5 / math.sqrt(len(y))  # sums of squares scatter by sqrt(2/n)
     for degree, half in _filters(reach):
         width = 2 * half + 1
-        left = _middle((y - savgol_filter(y, width, degree)) ** 2, valid, half)
-        left /= 1 - float(savgol_coeffs(width, degree)[half])
+        weights = _weights(width, degree)
+        left = _middle((y - convolve1d(y, weights, mode="constant")) ** 2, valid, half) / (1 - float(weights[half]))
         if left <= most * least:
             best = (width, degree)
         least = min(least, left)
         if left > 30 * least:
             break
     return best
+
+
+_weights = functools.cache(savgol_coeffs)
 
 
 def _middle(square: Array, valid: Bools, half: int) -> float:

@@ -49,7 +49,10 @@ def broken(name, row, value):
         (lambda: read(table()).split({"every": 2, "first": 1}), r"hold_out: found .*expected .*first: k\} of 1 trajectories"),
         (lambda: read(table()).split({"every": 1}), r"hold_out: all 1 trajectories; expected some for the fit"),
         (lambda: read(table()).split({"every": 1}, {"last": 0.5}), r"train: found .*expected \{trajectories"),
-        (lambda: read(table()).split({"from": 1, "to": 2}), r"hold_out: from 1 to 2 s; .* the recording goes from 0 to 0.39 s"),
+        (
+            lambda: read(table()).split({"from": 1, "to": 2}),
+            r"hold_out: from 1 s to 2 s; .* the recording goes from 0 to 0.39 s",
+        ),
         (lambda: read(table()).split({"from": "1 m"}), r"hold_out: unit 'm' does not fit; expected s"),
         (lambda: read(table()).split({"trajectories": ["log"]}), r"'log' is not a trajectory; did you mean 'log.csv'\?"),
         (

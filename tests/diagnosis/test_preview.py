@@ -43,14 +43,14 @@ def looked(u, effects=FEW, **how):
     return preview(*logged(u, **how), DiagnoseConfig(effects=effects))
 
 
-def fed_back(gain, seed=0, own=True):
+def fed_back(gain, seed=0, own=True, damping=4.0, every=200):
     """A sled whose force follows a command in steps, by the measured position and speed, or by the true ones."""
     rng, model = np.random.default_rng(seed), equations(SLED)
     x, rows, steps = np.zeros(2), [], rng.uniform(-0.5, 0.5, 12)
     for k in range(len(T)):
         y = x + [4e-4, 4e-3] * rng.standard_normal(2)
         z = y if own else x
-        u = gain * (steps[k // 200] - z[0]) - 4.0 * z[1]
+        u = gain * (steps[k // every] - z[0]) - damping * z[1]
         rows.append((*y, u))
         x = model.step(x[None], np.array([[u]])).x[0]
     y, v, u = np.array(rows).T
@@ -118,6 +118,38 @@ def test_a_controller_is_recognised(own):
     (loop,) = loops(model, Dataset.of(model, recording))
     assert loop.input == "F"
     assert loop.share > 2 * loop.chance
+
+
+def switched():
+    """A sled that is pushed to and fro by a switch, at the measured sum of position and speed, in a wind."""
+    rng, model = np.random.default_rng(2), equations(SLED)
+    x, rows, u = np.zeros(2), [], 2.0
+    for k in range(len(T)):
+        y = x + 4e-4 * rng.standard_normal(2)
+        s = y[0] + 0.1 * y[1] - 0.2
+        u = -2.0 if s > 0.02 else 2.0 if s < -0.02 else u
+        rows.append((y[0], u))
+        x = model.step(x[None], np.array([[u + 0.8 * np.sin(0.7 * T[k])]])).x[0]
+    return model, *np.array(rows).T
+
+
+def test_a_switch_that_follows_the_state_is_recognised():
+    model, x, u = switched()
+    (loop,) = loops(model, Dataset.of(model, gc.Recording.of(T, {"x": x, "F": u})))
+    assert (loop.input, loop.by) == ("F", "switch")
+    assert loop.share < 0.5 * loop.chance
+    assert loop.told.startswith("F is under feedback (by the state it should switch at ")
+    turns = np.flatnonzero(np.diff(u)) + 1
+    held = np.random.default_rng(0).permutation(np.diff(turns))
+    other = np.concatenate([u[: turns[0]], np.repeat(np.resize(u[turns[:2]], len(held)), held), u[turns[-1] :]])
+    model, recording = logged(other)
+    assert loops(model, Dataset.of(model, recording)) == ()
+
+
+def test_a_controller_that_mostly_rests_is_recognised():
+    model, recording = fed_back(40.0, own=False, damping=14.0, every=800)
+    (loop,) = loops(model, Dataset.of(model, recording))
+    assert loop.by == "state"
 
 
 @pytest.mark.parametrize("u", [PUSHED[:, 0], np.sign(PUSHED[:, 0]), np.random.default_rng(3).standard_normal(2400)])

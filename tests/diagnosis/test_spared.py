@@ -67,3 +67,13 @@ def test_a_defect_after_the_answer_leaves_it_standing(whole, monkeypatch, name, 
 def test_what_was_asked_wrongly_is_still_refused():
     with pytest.raises(gc.UsageError, match="experiment"):
         gc.diagnose(*late(), effects=["input-delay"], horizons=[1.0], experiment={"limits": {"nobody": [0, 1]}})
+
+
+def test_pushes_that_cannot_be_looked_for_are_told_so(whole, monkeypatch):
+    def refused(*given):
+        raise gc.UsageError("recording: 3 windows are too few")
+
+    monkeypatch.setattr(sys.modules["gapcert_diagnosis.diagnose"], "_listed", refused)
+    found = diagnosed()
+    assert found.warnings == ("pushes could not be looked for (recording: 3 windows are too few); the answer stands",)
+    assert [c.effect for c in found.causes] == [c.effect for c in whole.causes]

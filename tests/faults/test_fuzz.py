@@ -26,7 +26,7 @@ QUICK = {
     "mcap": 8,
     "run": 5,
 }
-SLOW = dict.fromkeys(TARGETS, 8) | {"figures": 2}
+SLOW = dict.fromkeys(TARGETS, 8) | {"diagnosis": 30, "figures": 2}
 
 
 def fuzzed(name: str, examples: int, folder: Path) -> None:

@@ -68,7 +68,7 @@ ASKED = {
         "last: 33 %",
         "from: 2 s",
         "15:13",
-        "hold_out: from 2 to inf s; expected at least 16 samples",
+        "hold_out: from 2 s; expected at least 16 samples",
         "the recording",
     ),
     "no such one": (

@@ -339,6 +339,13 @@ def _period(model: Model, recording: Recording) -> tuple[float, int]:
             f"recording.every: found {period:.6g} s, but samples are {raw:.6g} s apart; expected at least that; leave it out",
             ("recording", "every"),
         )
+    if repeat > THRESHOLDS.most_repeats:
+        raise UsageError(
+            f"recording: samples are {period:.6g} s apart, {repeat:,} steps of the model, {model.period:.6g} s; expected "
+            f"{THRESHOLDS.most_repeats:,} at most; is the time in s? Give the unit of that column otherwise, "
+            "recording.units: {TIME: ms}, or a longer period of the model",
+            ("recording",),
+        )
     if repeat >= 1 and off <= JITTER * period:
         return period, repeat
     even = all(np.abs(np.diff(tr.t) / period - 1).max() <= JITTER for tr in recording.trajectories)

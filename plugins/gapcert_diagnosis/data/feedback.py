@@ -19,7 +19,8 @@ class Loop:
     """An input that follows what is measured, the share of it that tells, and the largest such share without feedback.
 
     by: `surprise`: of what the past of the input does not tell, by what is measured up to then; `state`: of the changes of the
-    input, by those of the state, against the same spectrum played to the model without feedback.
+    input, by those of the state, against the same spectrum played to the model without feedback; `switch`: of the moments at
+    which the state would have the input switch, and it does not, against the same levels held as long in another order.
     """
 
     input: str
@@ -34,6 +35,8 @@ class Loop:
         how = f"what is measured tells {told} of what its own past does not"
         if self.by == "state":
             how = f"the state tells {told} of its changes, and {chance} at most without a loop"
+        if self.by == "switch":
+            how = f"by the state it should switch at {told} of the moments at which it does not, and at {chance} without a loop"
         return (
             f"{self.input} is under feedback ({how}): what the controller cancels hides in it, and causes look smaller than "
             "they are where only the held error shows; a log in which it is commanded, or moves faster, shows more"
@@ -54,6 +57,10 @@ def loops(model: Model, measured: Dataset, seed: int = 0) -> tuple[Loop, ...]:
         share, chance = _of_state(model, measured, i, rng)
         if share > THRESHOLDS.loop_share and 1 - share < THRESHOLDS.loop_rest * (1 - chance):
             found.append(Loop(s.name, "state", share, chance))
+            continue
+        share, chance = _switched(model, measured, i, rng)
+        if share < THRESHOLDS.loop_switch * chance:
+            found.append(Loop(s.name, "switch", share, chance))
     return tuple(found)
 
 
@@ -114,6 +121,60 @@ def _of_state(model: Model, m: Dataset, i: int, rng: np.random.Generator) -> tup
     return share, max((_told(a, b[:, i], m) for a, b in zip(moved, drawn, strict=True) if np.isfinite(a).all()), default=0.0)
 
 
+def _switched(model: Model, m: Dataset, i: int, rng: np.random.Generator) -> tuple[float, float]:
+    """(share, least without feedback) of moments at which the state would have an input of few levels switch, and it does not.
+
+    Without feedback: the model under the same levels, each held for as long as at another of its turns, anywhere or nearby.
+    """
+    piece = int(np.argmax([len(u) for u in m.inputs]))
+    count = min(len(m.inputs[piece]), THRESHOLDS.loop_samples)
+    x, u = m.states[piece][:count], m.inputs[piece][:count]
+    at, number = np.flatnonzero(np.diff(u[:, i])) + 1, len(np.unique(u[:, i]))
+    if number > THRESHOLDS.relay_levels or len(at) < THRESHOLDS.relay_switches * number or model.hidden:
+        return 1.0, 0.0
+    found = [(1.0, 0.0)]
+    for nearby in (len(at), THRESHOLDS.relay_nearby):
+        turns = np.arange(len(at)) // nearby
+        drawn = np.repeat(u[None], THRESHOLDS.loop_turns, axis=0)
+        for row in drawn:
+            held = np.diff(at)
+            for k in np.unique(turns):
+                for level in np.unique(u[:, i]):
+                    rows = np.flatnonzero((turns[:-1] == k) & (u[at[:-1], i] == level))
+                    held[rows] = rng.permutation(held[rows])
+            row[at[0] : at[-1], i] = np.repeat(u[at[:-1], i], held)
+        with np.errstate(all="ignore"):
+            fine = np.repeat(drawn, m.repeat, axis=1)[:, : (count - 1) * m.repeat]
+            moved = model.fast_rollout(np.repeat(x[:1], len(drawn), axis=0), fine, every=m.repeat).x
+        seen = [_early(a, b[:, i], nearby) for a, b in zip(moved, drawn, strict=True) if np.isfinite(a).all()]
+        found.append((_early(x, u[:, i], nearby), min(seen, default=0.0)))
+    return min(found, key=lambda f: f[0] / max(f[1], 1e-9))
+
+
+def _early(x: Array, u: Array, nearby: int) -> float:
+    """The share of (moment at which u switches, moment at which it does not) whose states are in the wrong order.
+
+    Along the one direction that tells them apart, among moments of one level, about the mean of so many switches.
+    """
+    at = np.flatnonzero(np.diff(u)) + 1
+    rows = np.arange(at[0], at[-1] + 1)
+    now = np.isin(rows, at)
+    x = (x - x.mean(axis=0))[rows] / np.maximum(x.std(axis=0), 1e-300)
+    turn = np.minimum(np.searchsorted(at, rows, side="right") - 1, len(at) - 1) // nearby
+    _, kind = np.unique(np.stack([turn, u[rows - 1]]), axis=1, return_inverse=True)
+    counts = np.bincount(kind)
+    x -= np.stack([np.bincount(kind, column) / counts for column in x.T], axis=-1)[kind]
+    wrong = pairs = 0.0
+    for level in np.unique(u[rows - 1]):
+        own = u[rows - 1] == level
+        law = np.linalg.lstsq(x[own], now[own] - now[own].mean(), rcond=THRESHOLDS.relay_cutoff)[0]
+        yes, no = np.sort(x[own & now] @ law), np.sort(x[own & ~now] @ law)
+        if len(yes) and len(no):
+            wrong += float(np.sum(len(no) - np.searchsorted(no, yes)))
+            pairs += len(yes) * len(no)
+    return wrong / pairs if pairs else 1.0
+
+
 def _surrogates(u: Array, rng: np.random.Generator) -> Array:
     """Inputs (n, T, nu) with the spectrum, the mean and the cross-spectrum of u (T, nu)."""
     spectrum = np.fft.rfft(u, axis=0)
@@ -124,10 +185,13 @@ def _surrogates(u: Array, rng: np.random.Generator) -> Array:
 
 def _told(x: Array, u: Array, m: Dataset) -> float:
     """The share of the changes of an input over `loop_change` s that those of the state tell, jumps aside."""
-    lag = m.samples(THRESHOLDS.loop_change)
+    lag, step = m.samples(THRESHOLDS.loop_change), np.abs(np.diff(u, prepend=u[0], append=u[-1]))
+    jumps = step[1:-1] > THRESHOLDS.loop_step * np.maximum(step[:-2], step[2:])
+    rows = np.convolve(jumps, np.ones(lag), "valid") < 0.5
     x, u = x[lag:] - x[:-lag], u[lag:] - u[:-lag]
-    rows = _even(u)
-    if np.ptp(u[rows]) <= THRESHOLDS.still * np.ptp(u) or _lines(np.where(rows, u, 0.0)) < THRESHOLDS.loop_lines * x.shape[1]:
+    if rows.sum() < THRESHOLDS.usual_samples or np.ptp(u[rows]) <= THRESHOLDS.still * np.ptp(u):
+        return 0.0
+    if _lines(np.where(rows, u, 0.0)) < THRESHOLDS.loop_lines * x.shape[1]:
         return 0.0
     return 1 - _left(x[rows], u[rows]) / max(float(np.var(u[rows])), 1e-300)
 

@@ -70,6 +70,8 @@ def _learnt(motion: Tangent, site: str, found: Mapping[str, Array], made: Array,
     columns = motion.coarse(made)
     kind = np.repeat(list(found), [f.shape[-1] for f in found.values()])
     columns = columns / (np.sqrt(np.mean(columns**2, axis=(0, 1))) + 1e-300)
+    sound = np.isfinite(columns).all(axis=(0, 1))  # where a state runs away, forces leave no number
+    columns, kind = columns[..., sound], kind[sound]
     residual = motion.coarse(rows)[..., 0]
     energy = np.sum(residual**2, axis=1)
     even = np.sqrt(np.minimum(1.0, THRESHOLDS.loud_window * np.median(energy) / np.maximum(energy, 1e-300)))[:, None]

@@ -244,7 +244,8 @@ def flags(library: Library, c: Candidate, fitted: Fit) -> tuple[str, ...]:
         value, unit = known[name], f" {library.units(c)[i]}".removesuffix(" 1")
         if name in implausible:
             least, most = implausible[name]
-            said = f"implausible: {p.name} = {value:.4g}{unit} is outside of {least:.4g} to {most:.4g}{unit}"
+            ends = f"below {least:.4g}{unit}" if value < least else f"above {most:.4g}{unit}"
+            said = f"implausible: {p.name} = {value:.4g}{unit} is {ends}"
             # A factor that does nothing at 1 (`off`) has no unit: its sign is a convention of the log.
             turned = not p.dimension and p.off == 1.0 and least <= -value <= most
             out.append(f"{said}; is the sign of {c.site} in the log the other way round than in the model?" if turned else said)

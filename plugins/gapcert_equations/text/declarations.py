@@ -15,8 +15,9 @@ Path = tuple[str | int, ...]
 
 
 def axes(declared: Axes) -> dict[str, Axis]:
-    """Short and long declarations alike: `rad` and `{unit: rad}`."""
-    return {name: Axis(unit=a) if isinstance(a, str) else a for name, a in declared.items()}
+    """Short and long declarations alike, `rad` and `{unit: rad}`; an empty unit is 1."""
+    long = {name: Axis(unit=a) if isinstance(a, str) else a for name, a in declared.items()}
+    return {name: a if a.unit.strip() else a.model_copy(update={"unit": "1"}) for name, a in long.items()}
 
 
 def velocities(config: EquationsConfig) -> dict[str, Axis]:

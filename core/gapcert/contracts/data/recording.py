@@ -255,7 +255,7 @@ class Recording:
         if not sides[0] or not sides[1]:
             t = np.concatenate([tr.t for tr in self.trajectories])
             span = f"the recording goes from {np.nanmin(t):.6g} to {np.nanmax(t):.6g} s"
-            what = f"hold_out: from {low:g} to {high:g} s"
+            what = "hold_out: " + " ".join(f"{w} {e:g} s" for w, e in (("from", low), ("to", high)) if np.isfinite(e))
             raise UsageError(f"{what}; expected at least {SHORTEST} samples on either side; {span}", HELD)
         return self._with(sides[0]), self._with(sides[1])
 
