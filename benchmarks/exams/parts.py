@@ -155,6 +155,16 @@ def plain(records: Sequence[Record]) -> list[Figure]:
     ]
 
 
+def looped(records: Sequence[Record]) -> list[Figure]:
+    hidden, still = ([r for r in records if bool(r["hidden"]) is some] for some in (True, False))
+    clear = [r for r in hidden if r["label"] == "clear"]
+    return [
+        least(f"class first ({len(clear)})", score.rate(clear, score.in_class), 0.93),
+        most("a wrong name stated as certain", score.rate(clear, score.certain_and_wrong), 0.01),
+        most(f"false alarms, nothing hidden ({len(still)})", score.rate(still, lambda r: bool(score.named(r))), 0.005),
+    ]
+
+
 def _dirty(seed: int, index: int, limit: float) -> Record:
     """Even cases are clean, odd ones are the case before, soiled."""
     from exams.hidden.log import DIRT
@@ -175,6 +185,8 @@ PARTS = {
     "experiments": Part(120, 2, play.experiment, experiments),
     "plain": Part(400, 20, lambda s, i, t: plants.ask(plants.single("plain", s, i), t), plain),
     "plain-nothing": Part(600, 9, lambda s, i, t: plants.ask(plants.nothing("plain-nothing", s, i), t), nothing),
+    "plain-pairs": Part(140, 4, lambda s, i, t: plants.ask(plants.pair("plain-pairs", s, i), t), pairs),
+    "plain-loops": Part(125, 5, lambda s, i, t: plants.ask(plants.looped("plain-loops", s, i), t), looped),
     "plain-unknown": Part(150, 4, lambda s, i, t: plants.unknown("plain-unknown", s, i, t), unknown),
     "joints": Part(
         72, 2, lambda s, i, t: sit.sit(draw.single("joints", s, i, (("arm",), ("cartpole",), ("chain",))[i % 3]), t), joints

@@ -46,9 +46,11 @@ KINDS = (
     "input-gain:slip",
     "sensor-scale:slip",
 )
+UNSLIPPED = tuple(k for k in KINDS if not k.endswith(":slip"))
 TURNED = (math.pi / 180, 60 / (2 * math.pi), 1000.0, 9.80665)
 SLIPS = (*TURNED, *(1 / s for s in TURNED))
 WAVES = ("steps", "multisine", "chirp", "feedback")
+LOOPED = tuple(n for n in NAMES if n != "strut")  # plants of which an output is controlled
 LAST = 0.75  # share of a single record that takes part in the fit
 MOST = 60  # rollouts that judge a case
 
@@ -87,11 +89,13 @@ def rig(p: Plant, kind: str, rng: np.random.Generator) -> Rig:
     tolerance, loose = float(rng.choice([0.02, 0.03])), np.array([rough for _, _, rough in p.values.values()])
     true = np.array([v for v, _, _ in p.values.values()])
     stated = true * (1 + 0.01 * rng.uniform(-1, 1, len(true)) * loose)
-    view = p.views[int(rng.integers(len(p.views)))]
+    # A controller sees what it is to hold.
+    views = [v for v in p.views if kind != "feedback" or p.shown[0] in v]
+    view = views[int(rng.integers(len(views)))]
     law, reference = np.array([0.0, 0, 0, p.middle, 0, -1]), np.zeros(count)
     middle, peak = p.middle, p.peak * rng.uniform(0.5, 1)
     if kind == "feedback":
-        column = p.shown.index(view[0])
+        column = 0
         integral, rate = ((0, 0), (1, 0), (1, 0.05))[int(rng.integers(3))]
         # What lies behind the slow pole bounds the loop.
         behind = 0.1 if len(p.states) > 1 else 1.0
@@ -195,12 +199,13 @@ def alike(r: Rig, h: Hidden) -> list[tuple[str, str]]:
         groups += [gains | ({("parameter", "K")} if name == "wheel" else set())]
     if alone:
         groups += [{("input-delay", u), ("sensor-delay", y)}]
-    if alone and (linear or name == "heater"):
+    if alone and (linear or name in ("heater", "oven")):
         # A constant twist between two speeds shows in neither, and a constant voltage at a condenser not in its current.
         unseen = {"tw", *(("i",) if (name, y) == ("rlc", "i") else ())}
         shifts = {("constant-force", s) for s in r.plant.states if s not in unseen} | {("sensor-bias", y)}
         groups += [shifts | (set() if "i" in unseen else {("input-offset", u)})]
-    first = {"motor": "i", "wheel": "v", "heater": "T", "tank": "h", "rc": "vc", "rlc": "i", "twin": "w1"}.get(name)
+    first = {"motor": "i", "wheel": "v", "heater": "T", "tank": "h", "rc": "vc", "rlc": "i", "twin": "w1"}
+    first = (first | {"tanks": "h1", "oven": "T1"}).get(name)
     if first:
         groups += [{("input-offset", u), ("constant-force", first)}]
     friction = {"motor": [("w", "b"), ("i", "R")], "twin": [("w1", "b")], "rlc": [("i", "R")], "rc": [("vc", "R"), ("vc", "C")]}
@@ -376,47 +381,82 @@ def places(kind: str, p: Plant, view: Sequence[str]) -> tuple[str, ...]:
     if effect == "external-push":
         return p.pushed
     # A one-sided input, and one about a middle far from zero, cannot have what acts at zero.
-    if p.name in ("heater", "tank") and kind.startswith(("input-dead-zone", "input-saturation:soft")):
+    if p.name in ("heater", "tank", "tanks", "oven") and kind.startswith(("input-dead-zone", "input-saturation:soft")):
         return ()
     return (
         tuple(view) if effect.startswith("sensor") else tuple(p.inputs) if effect.startswith(("input", "supply")) else p.sites
     )
 
 
-def nothing(part: str, seed: int, index: int) -> Case:
+def nothing(part: str, seed: int, index: int, waves: Sequence[str] = WAVES) -> Case:
+    names = NAMES if waves == WAVES else LOOPED
     rng = generator(part, seed, index)
-    return Case(part, seed, index, _drawn(NAMES[index % len(NAMES)], rng), (), "nothing")
+    return Case(part, seed, index, _drawn(names[index % len(names)], rng, waves), (), "nothing")
 
 
-def _drawn(name: str, rng: np.random.Generator, open_loop: bool = False) -> Rig:
+def _drawn(name: str, rng: np.random.Generator, waves: Sequence[str] = WAVES) -> Rig:
     p = plant(name, rng)
-    return rig(p, str(rng.choice(WAVES if p.loop and not open_loop else WAVES[:3])), rng)
+    return rig(p, str(rng.choice([w for w in waves if w != "feedback" or p.loop])), rng)
 
 
-def single(part: str, seed: int, index: int) -> Case:
+def single(part: str, seed: int, index: int, waves: Sequence[str] = WAVES) -> Case:
     """One effect, kinds in turn, in a plant that can have it; drawn again until it is clear."""
-    rng, kind = generator(part, seed, index), KINDS[index % len(KINDS)]
-    effect, _, form = kind.partition(":")
-    best = None
+    rng, kinds, best = generator(part, seed, index), KINDS if waves == WAVES else UNSLIPPED, None
+    kind, names = kinds[index % len(kinds)], NAMES if waves == WAVES else LOOPED
     for _ in range(40):
-        r = _drawn(str(rng.choice(NAMES)), rng, form == "slip")
-        sites = places(kind, r.plant, r.view)
-        if not sites or (effect == "external-push" and "runs" in r.excitation):
-            continue
-        site, still = str(rng.choice(sites)), r.play()
-        at, most = shape(kind, site, r, rng, still)
-        if form == "slip":
-            slip = next(iter(at(1.0).values()))
-            if effect == "input-gain":
-                r = replace(r, u=r.u / slip)
-            else:
-                r = replace(r, noise=r.noise * np.where(np.array(r.plant.shown) == site, slip, 1.0))
-        case = _sized(Case(part, seed, index, r, (), "hidden"), Hidden(effect, site, {}), at, most, rng)
-        if case.label == "clear":
+        r = _drawn(str(rng.choice(names)), rng, WAVES[:3] if kind.endswith(":slip") else waves)
+        case = _hiding(Case(part, seed, index, r, (), "hidden"), kind, rng)
+        if case is not None and case.label == "clear":
             return case
-        best = case if best is None or case.strength > best.strength else best
+        best = case if best is None or (case is not None and case.strength > best.strength) else best
     assert best is not None
     return best
+
+
+def pair(part: str, seed: int, index: int) -> Case:
+    """Two effects, each clear alone; with the other refitted, one noise floor remains of each, or parameters are off."""
+    rng, best = generator(part, seed, index), None
+    for _ in range(60):
+        case = Case(part, seed, index, _drawn(str(rng.choice(NAMES)), rng), (), "hidden")
+        a, b = (_hiding(case, kind, rng) for kind in (UNSLIPPED[index % len(UNSLIPPED)], str(rng.choice(UNSLIPPED))))
+        if a is None or b is None or a.label != "clear" or b.label != "clear":
+            continue
+        one, two = a.hidden[0], b.hidden[0]
+        if two.key in alike(case.rig, one):
+            continue
+        judge = Judge(case.rig, (one, two))
+        left = [judge.fit((other,)) for other in (two, one)]
+        clear = all(remains >= LEFT or paid >= TOLERANCES**2 for _, paid, remains in left)
+        label, remains = "clear" if clear else "hidden", min(remains for _, _, remains in left)
+        best = replace(case, hidden=(one, two), label=label, strength=judge.strength(), remains=remains)
+        if clear:
+            return best
+    assert best is not None
+    return best
+
+
+def _hiding(case: Case, kind: str, rng: np.random.Generator) -> Case | None:
+    """The case with an effect of that kind at a site that is drawn; None where its plant cannot have one."""
+    r, effect = case.rig, kind.partition(":")[0]
+    sites = places(kind, r.plant, r.view)
+    if not sites or (effect == "external-push" and "runs" in r.excitation):
+        return None
+    site, still = str(rng.choice(sites)), r.play()
+    at, most = shape(kind, site, r, rng, still)
+    if kind.endswith(":slip"):
+        slip = next(iter(at(1.0).values()))
+        if effect == "input-gain":
+            r = replace(r, u=r.u / slip)
+        else:
+            r = replace(r, noise=r.noise * np.where(np.array(r.plant.shown) == site, slip, 1.0))
+    return _sized(replace(case, rig=r), Hidden(effect, site, {}), at, most, rng)
+
+
+def looped(part: str, seed: int, index: int) -> Case:
+    """Under feedback: one effect, or in every fifth case nothing."""
+    if index % 5 < 4:
+        return single(part, seed, index, WAVES[3:])
+    return replace(nothing(part, seed, index // 5, WAVES[3:]), index=index)
 
 
 def _sized(case: Case, h: Hidden, at: Any, most: float, rng: np.random.Generator) -> Case:

@@ -206,11 +206,9 @@ class Spared:
         self.told: list[str] = []
 
     def __call__(self, part: str, otherwise: U, make: Callable[..., T], *given: Any) -> T | U:
-        """`make(*given)`, or `otherwise` where it fails; UsageError passes, as it is about what was asked."""
+        """`make(*given)`, or `otherwise` where it fails."""
         try:
             return make(*given)
-        except UsageError:
-            raise
         except Exception as error:  # a defect after the answer must not take it along
             self.told.append(
                 f"the {part} could not be made ({type(error).__name__}: {error}); please report it; the answer stands"
@@ -267,7 +265,7 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
     lap("leftover")
     ties = [tuple(c.told for c in tie) for tie, _ in answer.ties]
     ties += [(("engine-setting", s.runner_up.setting),) for s in settings if s.runner_up and s.margin < THRESHOLDS.tie_score]
-    rest = leftover.unexplained(left, pushed) if verdict == "unexplained" else None
+    rest = spared("kind of what is missing", None, leftover.unexplained, left, pushed) if verdict == "unexplained" else None
     correction = None if rest is None else rest.correction
     changed = f"setting {' and '.join(s.variant.setting for s in settings)}"
     first = (changed, answer.plain) if settings and answer.plain is not None else None

@@ -303,7 +303,8 @@ def _groups(path: _Fitted) -> Sequence[tuple[_Place, Causes, _Axis, Array]]:
     for c in path.causes:
         if c.effect.site == "output":
             continue
-        place = _place(path, c)
+        if (place := _place(path, c)) is None:
+            continue
         law = place.size(path.added((c,)))
         axes = path.axes(place)
         shares = [_carried(law, a) for a in axes]
@@ -325,14 +326,17 @@ def _turned(path: _Fitted, c: Candidate, place: _Place, axes: list[_Axis]) -> _A
     return next((a for a in axes if (a.name in inputs if follows else a.name == place.site)), None)
 
 
-def _place(path: _Fitted, c: Candidate) -> _Place:
-    """Of a parameter: the one of all known by now, coordinates among them, whose motion it changes most."""
+def _place(path: _Fitted, c: Candidate) -> _Place | None:
+    """Of a parameter: the one of all known by now, coordinates among them, or else inputs, whose motion it changes most."""
     if c.effect.site != "parameter":
         return path.place(c.site, c.effect.site)
     moved, spread = path.added((c,)), np.std(path.x, axis=(0, 1)) + 1e-300
     for q in path.base.sites("coordinate"):
         path.place(q, "coordinate")
-    return max(path.places.values(), key=lambda p: float(np.sqrt(np.mean(moved[..., p.column] ** 2)) / spread[p.column]))
+    for u in () if path.places else path.base.sites("input"):
+        path.place(u, "input")
+    changed = np.sqrt(np.mean(moved**2, axis=(0, 1))) / spread
+    return max(path.places.values(), key=lambda p: float(changed[p.column]), default=None)
 
 
 def _law(path: _Fitted, place: _Place, group: Causes, axis: _Axis, law: Array) -> Law:

@@ -60,3 +60,35 @@ def test_an_empty_unit_is_none(unit):
     }
     model = equations({**free, "bias": {"q": "k*q"}})
     assert [s.unit for s in model.states] == ["1", "1/s"]
+
+
+def test_a_period_of_a_second_makes_no_state_a_position():
+    """The slope of a state by itself is about 1 then, as that of a position by a speed in s."""
+    basin = {"states": {"h": "m"}, "inputs": {"q": "m^3/s"}, "derivative": {"h": "(q - c*sqrt(max(h, 0)))/A"}, "period": "1 s"}
+    basin |= {"kind": "equations", "parameters": {"c": {"value": "0.02 m^2.5/s", "tolerance": "3 %"}, "A": "0.3 m^2"}}
+    rng, h, y = np.random.default_rng(1), 0.6, []
+    flow = rng.uniform(0, 0.03, 40).repeat(15)
+    for q in flow:
+        y.append(h + 2e-3 * rng.standard_normal())
+        h += (q - 0.012 * h - 0.004 * np.sin(9 * h)) / 0.3
+    recording = Recording((Trajectory(1.0 * np.arange(600), {"h": np.array(y), "q": flow}, "log"),))
+    found = gc.diagnose(equations(basin), recording, ["coulomb-friction"])
+    assert found.verdict == "unexplained"
+    assert found.warnings == ()
+    assert found.unexplained.correction is not None
+    assert "{q}" not in found.unexplained.correction.extension.force
+
+
+def test_a_parameter_where_nothing_has_a_coordinate_is_drawn_at_an_input():
+    rng, x, y = np.random.default_rng(3), 0.0, []
+    u = rng.uniform(-1, 1, 30).repeat(20)
+    for v in u:
+        y.append(x + 3e-3 * rng.standard_normal())
+        x = 0.9 * x + 0.14 * v
+    step = {"kind": "equations", "states": {"x": "1"}, "inputs": {"u": "1"}, "next": {"x": "a*x + b*u"}, "period": "50 ms"}
+    model = equations(step | {"parameters": {"a": 0.9, "b": {"value": 0.1, "tolerance": "5 %"}}})
+    recording = Recording((Trajectory(0.05 * np.arange(600), {"x": np.array(y), "u": u}, "log"),))
+    found = gc.diagnose(model, recording, ["parameter"])
+    assert [(c.effect, c.site) for c in found.causes] == [("parameter", "b")]
+    assert found.warnings == ()
+    assert found.figure.laws

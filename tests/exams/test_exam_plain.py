@@ -64,6 +64,8 @@ def test_a_strut_feels_the_speed_that_is_played():
         ("cylinder", "input-rate-limit", {"rate": 30.0}),
         ("twin", "supply-sag", {"sag": 3.0, "time_constant": 0.5}),
         ("tank", "sensor-scale", {"scale": 1.1}),
+        ("tanks", "external-push", {"force": 1e-3, "time": 200.0, "duration": 100.0}),
+        ("oven", "input-gain", {"gain": 1.2}),
     ],
 )
 def test_effects_act_as_the_library_writes_them(name, effect, numbers):
@@ -82,6 +84,31 @@ def test_a_case_is_a_function_of_its_seed_and_index():
     one, two = (c.recording().trajectories[0].channels for c in (a, b))
     assert all(np.array_equal(one[n], two[n]) for n in one)
     assert a.hidden[0].numbers != other.hidden[0].numbers
+
+
+@pytest.mark.exam
+def test_of_a_pair_each_is_clear_beside_the_other():
+    case = plain.pair("t", 1, 2)
+    one, two = case.hidden
+    assert case.label == "clear"
+    assert two.key not in plain.alike(case.rig, one)
+    judge = plain.Judge(case.rig, case.hidden)
+    assert judge.fit(case.hidden)[0] - judge.own < 9
+    for other in case.hidden:
+        _, paid, remains = judge.fit((other,))
+        assert remains >= case.remains
+        assert remains >= 1 or paid >= 25
+    assert len(case.question()["classes"]) == 2
+
+
+def test_in_loops_a_controller_sees_what_it_holds_and_every_fifth_has_nothing():
+    cases = [plain.looped("t", 1, 5 * k + 4) for k in range(10)]
+    assert [c.index for c in cases] == list(range(4, 54, 5))
+    assert {c.rig.plant.name for c in cases} == set(NAMES) - {"strut"}
+    for c in cases:
+        assert c.hidden == ()
+        assert c.rig.excitation.startswith("feedback")
+        assert c.rig.plant.shown[0] in c.rig.view
 
 
 @pytest.mark.exam

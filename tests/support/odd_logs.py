@@ -96,6 +96,21 @@ def _plants() -> dict[str, Plant]:
         "parameters": {"m": "1 kg", "n": "0.5 kg", "k": {"value": "30 N/m", "tolerance": "2 %"}},
     }
     pair |= {"mass_matrix": [["m", "0"], ["0", "n"]], "bias": {"p": "k*(p - q)", "q": "k*(q - p)"}, "forces": {"p": "u"}}
+    tank = {"states": {"h": M}, "inputs": {"q": "m^3/s"}, "derivative": {"h": "(q - c*sqrt(max(h, 0)))/A"}}
+    tank |= {"parameters": {"c": {"value": "0.02 m^2.5/s", "tolerance": "3 %"}, "A": "0.3 m^2"}}
+    limit = {"states": {"x": "1"}, "inputs": {"u": "1"}, "derivative": {"x": "(min(max(u, -s), s) - abs(x)*x)/T"}}
+    limit |= {"parameters": {"T": "0.3 s", "s": {"value": 0.8, "tolerance": "2 %"}}}
+    bell = {
+        "states": {"a": {"unit": "rad", "kind": "angle"}, "b": "rad/s"},
+        "derivative": {"a": "b", "b": "-w**2*sin(a) - 2*d*w*b"},
+    }
+    bell |= {"parameters": {"w": {"value": "9 1/s", "tolerance": "2 %"}, "d": 0.001}}
+    both = {
+        "states": {"x": "1", "y": "1"},
+        "inputs": {"u": "1", "v": "1"},
+        "next": {"x": "0.8*x + 0.1*y + u", "y": "0.5*y + v"},
+    }
+    both |= {"outputs": {"x": "x", "z": "k*x + y + u"}, "parameters": {"k": {"value": 2, "tolerance": "5 %"}}}
     return {
         "pendulum": Plant(pendulum, lambda x, u: (x[1], -19.62 * np.sin(x[0]) + 4 * u - 0.2 * x[1]), state("q"), (0.5, 0), 1.0),
         "normalised": Plant(normal, lambda x, u: (x[1], -16 * np.sin(x[0])), state("q", "q_dot"), (0.8, 0)),
@@ -122,6 +137,18 @@ def _plants() -> dict[str, Plant]:
         "step": Plant(step, lambda x, u: (0.9 * x[0] + 0.1 * u,), state("x"), (0,), 1.0, 0.05, True),
         "twice": Plant(twice, lambda x, u: ((1.1 * u - x[0]) / 0.4,), state("x"), (0,), 1.0),
         "zero": Plant(zero, lambda x, u: ((u - x[0] + 0.1 * x[0] ** 2) / 0.4,), state("x"), (0,), 1.0),
+        "tank": Plant(tank, lambda x, u: ((u - 0.02 * np.sqrt(max(x[0], 0))) / 0.3,), state("h"), (0.5,), 0.03, 1.0),
+        "limit": Plant(limit, lambda x, u: ((min(max(u, -0.7), 0.7) - abs(x[0]) * x[0]) / 0.3,), state("x"), (0,), 2.0),
+        "bell": Plant(bell, lambda x, u: (x[1], -81 * np.sin(x[0]) - 0.04 * x[1]), state("a"), (1, 0)),
+        "both": Plant(
+            both,
+            lambda x, u: (0.8 * x[0] + 0.1 * x[1] + u, 0.5 * x[1] + u),
+            lambda x, u: {"z": 2.2 * x[:, 0] + x[:, 1] + u},
+            (0, 0),
+            1.0,
+            0.1,
+            True,
+        ),
         "pair": Plant(
             pair, lambda x, u: (x[2], x[3], 30 * (x[1] - x[0]) + u, 60 * (x[0] - x[1])), state("p", "q"), (0, 0.1, 0, 0), 2.0
         ),
@@ -396,6 +423,19 @@ def _period(spec, rng, files):
     spec["model"]["period"] = rng.choice(["1 ms", "7 ms", "0.02 s", "1 s", "1e-4 s"])
 
 
+def _every(spec, rng, files):
+    spec["recording"]["every"] = rng.choice(["0.04 s", "0.1 s", "1 s", "1 ms"])
+
+
+def _model(spec, rng, files):
+    """A word of the equations is changed."""
+    section = rng.choice([k for k in ("derivative", "next", "bias", "forces") if spec["model"].get(k)])
+    name = rng.choice([*spec["model"][section]])
+    text = spec["model"][section][name]
+    ways = [f"-({text})", f"2*({text})", f"({text})**3", f"0*({text})", f"({text})/1e-9", f"1e6*({text})", f"sqrt(({text})**2)"]
+    spec["model"][section][name] = rng.choice(ways)
+
+
 def _hold(spec, rng, files):
     spec["recording"]["hold"] = rng.choice(["zero", "first"])
 
@@ -422,7 +462,7 @@ def _output(spec, rng, files):
 
 SPECS = (
     *(_hold_out, _train, _horizons, _window, _exact, _limits, _unknown, _missing, _values, _tolerances, _substeps, _period),
-    *(_hold, _units, _unseen, _output),
+    *(_every, _model, _model, _hold, _units, _unseen, _output),
 )
 
 

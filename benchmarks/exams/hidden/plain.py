@@ -1,4 +1,4 @@
-"""Plants written as plain derivatives, by another hand: motors, wheels, heaters, tanks, valves, circuits, struts, twin drives.
+"""Plants written as plain derivatives, by another hand: motors, wheels, heaters, tanks, valves, circuits, struts, cascades.
 
 Nothing here comes from equation text: derivatives are written out and compiled, and take Runge–Kutta steps far shorter than the
 fastest time constant. Dry friction stops a speed within the step that it can. Delays are exact means over these steps.
@@ -47,6 +47,13 @@ def derivative(number: int, p: Array, x: Array, a: float, d: Array) -> None:
         d[1] = (a - p[0] * x[1] - x[0]) / p[1]
     elif number == 7:  # strut
         d[0] = a
+    elif number == 9:  # tanks, the first of which runs into the second
+        flow = p[2] * math.sqrt(2 * p[4] * max(x[0], 0.0))
+        d[0] = (a - flow) / p[0]
+        d[1] = (flow - p[3] * math.sqrt(2 * p[4] * max(x[1], 0.0))) / p[1]
+    elif number == 10:  # oven: heating element, chamber
+        d[0] = (a - p[2] * (x[0] - x[1])) / p[0]
+        d[1] = (p[2] * (x[0] - x[1]) - p[3] * (x[1] - p[4])) / p[1]
     else:  # twin: speeds of motor and load, twist
         shaft = p[3] * x[2] + p[4] * (x[0] - x[1])
         d[0] = (a - shaft - p[2] * x[0]) / p[0]
@@ -207,7 +214,7 @@ class Plant:
         return tuple(self.outputs or self.states)
 
 
-NAMES = ("motor", "wheel", "heater", "tank", "cylinder", "rc", "rlc", "strut", "twin")
+NAMES = ("motor", "wheel", "heater", "tank", "cylinder", "rc", "rlc", "strut", "twin", "tanks", "oven")
 
 
 def plant(name: str, rng: np.random.Generator) -> Plant:
@@ -317,7 +324,7 @@ def plant(name: str, rng: np.random.Generator) -> Plant:
         R, slow = drawn(1e3, 1e5), drawn(5e-3, 0.1)
         values = {"R": (R, "ohm", True), "C": (slow / R, "F", True)}
         return Plant(
-            name, {"vc": "V"}, {"u": "V"}, {"vc": "(u - vc)/(R*C)"}, values, (slow, slow), 0.0, 5.0, (("vc",),), (), ()
+            name, {"vc": "V"}, {"u": "V"}, {"vc": "(u - vc)/(R*C)"}, values, (slow, slow), 0.0, 5.0, (("vc",),), loop=1.0
         )
     if name == "rlc":
         w, z, C = 2 * math.pi * drawn(2, 20), drawn(0.1, 0.7), drawn(1e-5, 1e-3)
@@ -333,10 +340,8 @@ def plant(name: str, rng: np.random.Generator) -> Plant:
             0.0,
             5.0,
             (("vc",), ("i",), ("vc", "i")),
-            (),
-            (),
-            0.0,
-            (0.0, 0.0),
+            loop=1.0,
+            rest=(0.0, 0.0),
         )
     if name == "strut":
         force = drawn(50, 5000)
@@ -359,6 +364,48 @@ def plant(name: str, rng: np.random.Generator) -> Plant:
             (("F",), ("x", "F")),
             outputs=text,
             hold="first",
+        )
+    if name == "tanks":
+        A, level, slow, lower, later = drawn(0.05, 0.5), drawn(0.4, 1.0), drawn(40, 200), drawn(0.4, 1.0), drawn(40, 200)
+        flow = 2 * level * A / slow
+        out = {"a1": flow / math.sqrt(2 * 9.81 * level), "a2": flow / math.sqrt(2 * 9.81 * lower)}
+        values = {"A1": (A, "m^2", True), "A2": (flow * later / (2 * lower), "m^2", True)}
+        values |= {n: (v, "m^2", True) for n, v in out.items()} | {"g": (9.81, "m/s^2", False)}
+        between = "a1*sqrt(2*g*max(h1, 0))"
+        return Plant(
+            name,
+            {"h1": "m", "h2": "m"},
+            {"q": "m^3/s"},
+            {"h1": f"(q - {between})/A1", "h2": f"({between} - a2*sqrt(2*g*max(h2, 0)))/A2"},
+            values,
+            (max(slow, later), min(slow, later)),
+            flow,
+            0.4 * flow,
+            (("h1", "h2"), ("h2",)),
+            pushed=("h1", "h2"),
+            loop=slow / A,
+            rest=(level, lower),
+        )
+    if name == "oven":
+        C, slow, part, fast = drawn(5, 60), drawn(100, 400), drawn(0.1, 0.4), drawn(5, 30)
+        U, k = C / slow, part * C / fast
+        values = {"C1": (part * C, "J/K", True), "C2": (C, "J/K", True), "k": (k, "W/K", True), "U": (U, "W/K", True)}
+        values |= {"Ta": (293.0, "K", False)}
+        middle = drawn(15, 40) * U
+        warm = 293.0 + middle / U
+        return Plant(
+            name,
+            {"T1": "K", "T2": "K"},
+            {"P": "W"},
+            {"T1": "(P - k*(T1 - T2))/C1", "T2": "(k*(T1 - T2) - U*(T2 - Ta))/C2"},
+            values,
+            (slow, fast),
+            middle,
+            middle,
+            (("T1", "T2"), ("T2",)),
+            pushed=("T1", "T2"),
+            loop=1 / U + 1 / k,
+            rest=(warm + middle / k, warm),
         )
     J, part, slow, w, z = drawn(1e-4, 1e-2), drawn(0.3, 3), drawn(0.2, 0.8), 2 * math.pi * drawn(4, 15), drawn(0.03, 0.15)
     inner = J * part / (1 + part)

@@ -313,6 +313,7 @@ class Tangent:
         v = names.index(site)
         # ∂xᵢ⁺/∂xⱼ ≈ period: xⱼ is the velocity of xᵢ.
         driven = np.abs(self.linear.A[..., v] / self.model.period - 1).mean(axis=(0, 1)) < 0.05
+        driven[v] = False
         return (int(np.argmax(driven)) if driven.any() else None), v
 
     def gather(self, pieces: list[Array]) -> Array:

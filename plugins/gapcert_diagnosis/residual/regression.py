@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import lfilter
 
-from gapcert.plugin import Array, EffectParameter, Extension, Parameter, site_units
+from gapcert.plugin import Array, EffectParameter, Extension, Parameter, position, site_units
 from gapcert_diagnosis.fitting.linearised import Tangent
 from gapcert_diagnosis.results import Correction
 from gapcert_diagnosis.thresholds import THRESHOLDS
@@ -72,6 +72,8 @@ def _learnt(motion: Tangent, site: str, found: Mapping[str, Array], made: Array,
     columns = columns / (np.sqrt(np.mean(columns**2, axis=(0, 1))) + 1e-300)
     sound = np.isfinite(columns).all(axis=(0, 1))  # where a state runs away, forces leave no number
     columns, kind = columns[..., sound], kind[sound]
+    if not kind.size:
+        return Learnt(site, dict.fromkeys(("static", "periodic", *MEMORY), 0.0), 0.0, 0.0)
     residual = motion.coarse(rows)[..., 0]
     energy = np.sum(residual**2, axis=1)
     even = np.sqrt(np.minimum(1.0, THRESHOLDS.loud_window * np.median(energy) / np.maximum(energy, 1e-300)))[:, None]
@@ -253,7 +255,7 @@ def _terms(motion: Tangent, site: str) -> list[Term]:
         found = ((1, z, values), (2, f"{z}*abs({z})", values * np.abs(values)), (3, f"{z}**3", values**3))
         return [Term("{c}*" + text, {"force": 1, dimension: -n}, power) for n, text, power in found]
 
-    q, v = motion.place(site)
+    q, v = motion.place(site) if position(motion.model, site) is not None else (None, motion.place(site)[1])
     speed = motion.x[..., v]
     brisk = float(np.sqrt(np.mean(speed**2))) or 1.0
     out = [Term("{c}", {"force": 1}, np.ones_like(speed)), *powers("velocity", "{v}", speed)]
