@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from exams import outputs as misfits
 from exams import plain as plants
 from exams import play, score, sit
 from exams.hidden import draw
@@ -165,6 +166,17 @@ def looped(records: Sequence[Record]) -> list[Figure]:
     ]
 
 
+def outputs(records: Sequence[Record]) -> list[Figure]:
+    loud = [r for r in records if "error" not in r]
+    return [
+        most("nothing, where an output is misfitted", score.rate(loud, score.silent), 0.0),
+        least(
+            "unexplained, or with causes that are flagged", score.rate(loud, lambda r: score.flagged(r) or not score.named(r))
+        ),
+        Figure("CPU time, median", "s", score.median([r["cpu"] for r in records])),
+    ]
+
+
 def _dirty(seed: int, index: int, limit: float) -> Record:
     """Even cases are clean, odd ones are the case before, soiled."""
     from exams.hidden.log import DIRT
@@ -188,6 +200,8 @@ PARTS = {
     "plain-pairs": Part(140, 4, lambda s, i, t: plants.ask(plants.pair("plain-pairs", s, i), t), pairs),
     "plain-loops": Part(125, 5, lambda s, i, t: plants.ask(plants.looped("plain-loops", s, i), t), looped),
     "plain-unknown": Part(150, 4, lambda s, i, t: plants.unknown("plain-unknown", s, i, t), unknown),
+    "outputs": Part(600, 11, lambda s, i, t: misfits.ask("outputs", s, i, t, True), outputs),
+    "outputs-nothing": Part(120, 6, lambda s, i, t: misfits.ask("outputs-nothing", s, i, t, False), nothing),
     "joints": Part(
         72, 2, lambda s, i, t: sit.sit(draw.single("joints", s, i, (("arm",), ("cartpole",), ("chain",))[i % 3]), t), joints
     ),
