@@ -125,13 +125,14 @@ def joints(records: Sequence[Record]) -> list[Figure]:
 
 def experiments(records: Sequence[Record]) -> list[Figure]:
     asked = [r for r in records if "designed" in r and score.open_question(r)]
-
-    def resolved(name: str) -> Rate:
-        return score.rate([r[name] | {"equal": r["equal"]} for r in asked], score.resolved)
-
+    resolved = score.rate(asked, score.resolved)
+    pairs = [p for r in asked for p in r["apart"] if p["promised"] > 0.03]
+    kept = score.rate(pairs, lambda p: abs(p["found"] / p["promised"] - 1) <= 0.3)
     return [
-        least(f"resolved by the proposed experiment ({len(asked)})", resolved("designed"), 0.9),
-        *(least(f"resolved by a {kind}", resolved(kind)) for kind in play.FIXED),
+        least(f"resolved by the proposed experiment ({len(asked)})", resolved, 0.9),
+        least("within the range of the recording, to 2 %", score.rate(asked, lambda r: r["beyond"] <= 0.02), 1.0),
+        least(f"separation within 30 % of what was promised, of pairs ({len(pairs)})", kept, 0.9),
+        Figure("separation found over promised, median", "share", score.median([p["found"] / p["promised"] for p in pairs])),
     ]
 
 

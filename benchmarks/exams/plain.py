@@ -46,10 +46,12 @@ KINDS = (
     "input-gain:slip",
     "sensor-scale:slip",
 )
+ALIKE = (*KINDS[:3], *KINDS[5:7], *KINDS[8:14])  # with rivals that an input tells apart
 UNSLIPPED = tuple(k for k in KINDS if not k.endswith(":slip"))
 TURNED = (math.pi / 180, 60 / (2 * math.pi), 1000.0, 9.80665)
 SLIPS = (*TURNED, *(1 / s for s in TURNED))
 WAVES = ("steps", "multisine", "chirp", "feedback")
+POOR = ("sine", "one way", "one level")  # under which laws look alike
 LOOPED = tuple(n for n in NAMES if n != "strut")  # plants of which an output is controlled
 LAST = 0.75  # share of a single record that takes part in the fit
 MOST = 60  # rollouts that judge a case
@@ -61,6 +63,10 @@ def wave(kind: str, count: int, period: float, times: tuple[float, float], rng: 
     if kind == "multisine":
         f = np.exp(rng.uniform(math.log(0.03 / slow), math.log(0.25 / fast), 10))
         w = np.sin(2 * np.pi * f[:, None] * t + rng.uniform(0, 2 * np.pi, (10, 1))).sum(axis=0)
+    elif kind in POOR:
+        s = np.sin(2 * np.pi * (rng.uniform(0.03, 0.12) / slow * t + rng.random()))
+        swing, ramp = rng.uniform(0.1, 0.4), np.minimum(t / (5 * slow), 1)
+        w = {"sine": s, "one way": (1 + swing * s) * ramp, "one level": np.floor(1 + 3 * t / (count * period)) / 3}[kind]
     elif kind == "chirp":
         low, high, long = 0.03 / slow, 0.2 / fast, max(count * period / 2, 10 * slow)
         s = t % long
@@ -158,6 +164,14 @@ class Case:
     @cached_property
     def judge(self) -> Judge:
         return Judge(self.rig, self.hidden)
+
+    def given(self, u: Array, start: Array, held: float, salt: int) -> Case:
+        """The same machine from another start and held input, under another input (T, nu), with fresh noise of its kind."""
+        r, count, rng = self.rig, len(u), generator(self.part, self.seed, self.index, salt)
+        noise = np.stack([coloured(count, r.colour, rng) for _ in r.plant.shown], axis=1) * r.noise.std(axis=0)
+        begins = np.where(np.arange(count) == 0, RUN, 0).astype(np.int64)
+        more = {"reference": np.zeros(count), "law": np.array([0.0, 0, 0, held, 0, -1]), "starts": start[None]}
+        return replace(self, rig=replace(r, u=u[:, 0], noise=noise, begins=begins, **more))
 
     def question(self) -> dict[str, Any]:
         r = self.rig
@@ -388,6 +402,26 @@ def places(kind: str, p: Plant, view: Sequence[str]) -> tuple[str, ...]:
     )
 
 
+def doubtful(part: str, seed: int, index: int) -> Case:
+    """One effect, kinds in turn, in a short noisy log of a single poor input, where several may look alike."""
+    rng, kind, case = generator(part, seed, index), ALIKE[index % len(ALIKE)], None
+    for _ in range(20):
+        p = plant(str(rng.choice(NAMES)), rng)
+        r = rig(p, str(rng.choice(POOR)), rng)
+        if not (sites := places(kind, p, r.view)) or "runs" in r.excitation:
+            continue
+        n = int(rng.integers(600, 1000))
+        short = {name: getattr(r, name)[:n] for name in ("u", "reference", "noise", "begins")}
+        short["noise"] = short["noise"] * (rng.uniform(0.01, 0.04) * np.std(r.play()[1]) / r.noise.std(axis=0).max())
+        r = replace(r, **short, hold="zero", horizon=float(f"{min(r.horizon, n * r.period / 12):.2g}"))
+        at, most = shape(kind, site := str(rng.choice(sites)), r, rng, r.play())
+        case, _ = _reached(Case(part, seed, index, r, (), "hidden"), Hidden(kind.partition(":")[0], site, {}), at, most, rng)
+        if case.label == "clear":
+            break
+    assert case is not None
+    return case
+
+
 def nothing(part: str, seed: int, index: int, waves: Sequence[str] = WAVES) -> Case:
     names = NAMES if waves == WAVES else LOOPED
     rng = generator(part, seed, index)
@@ -459,25 +493,34 @@ def looped(part: str, seed: int, index: int) -> Case:
     return replace(nothing(part, seed, index // 5, WAVES[3:]), index=index)
 
 
-def _sized(case: Case, h: Hidden, at: Any, most: float, rng: np.random.Generator) -> Case:
-    """The effect at a strength drawn between CLEAR and STRONGEST, larger where refitting would hide it."""
+def _reached(case: Case, h: Hidden, at: Any, most: float, rng: np.random.Generator) -> tuple[Case, float]:
+    """The effect at a strength drawn between CLEAR and STRONGEST, or the most that it can have; and its size."""
     target = math.exp(rng.uniform(math.log(1.1 * CLEAR), math.log(STRONGEST)))
 
     @cache
-    def made(k: float) -> Judge:
-        return Judge(case.rig, (Hidden(*h.key, at(k)),))
+    def strength(k: float) -> float:
+        return Judge(case.rig, (Hidden(*h.key, at(k)),)).strength()
 
     low, high, size = math.log(1e-4 * most), math.log(most), most
-    if made(most).strength() > target and at(most) != at(low):
+    if strength(most) > target and at(most) != at(low):
         for _ in range(10):
             middle = 0.5 * (low + high)
-            value = made(math.exp(middle)).strength()
+            value = strength(math.exp(middle))
             low, high = (low, middle) if value >= target else (middle, high)
             if abs(value / target - 1) < 0.05:
                 break
         size = math.exp(high)
+    found = strength(size)
+    label = "clear" if np.isfinite(found) and found >= CLEAR else "hidden"
+    return replace(case, hidden=(Hidden(*h.key, at(size)),), label=label, strength=found), size
+
+
+def _sized(case: Case, h: Hidden, at: Any, most: float, rng: np.random.Generator) -> Case:
+    """As `_reached`, and larger where refitting would hide it."""
+    _, size = _reached(case, h, at, most, rng)
     while True:
-        strength, (_, paid, remains) = made(size).strength(), made(size).fit()
+        judge = Judge(case.rig, (Hidden(*h.key, at(size)),))
+        strength, (_, paid, remains) = judge.strength(), judge.fit()
         seen = remains >= LEFT or paid >= TOLERANCES**2
         if size >= most or seen or strength < CLEAR:
             break

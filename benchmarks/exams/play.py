@@ -1,6 +1,7 @@
-"""Experiments: where an answer is ambiguous, the proposed input is played on the hidden system, and fixed inputs beside it.
+"""Experiments: where an answer is ambiguous, the proposed input is played on the hidden system, from where it says.
 
-All keep to the same limits of inputs and outputs, and to the same length.
+Every third case is a robot, the others are plants of another hand. Beside the answer to both logs stands how far the rivals of
+the truth then are apart without noise, and how far the motion left the range of the recording.
 """
 
 from __future__ import annotations
@@ -12,88 +13,117 @@ from typing import Any
 import numpy as np
 
 import gapcert as gc
-from exams import sit
-from exams.hidden.draw import Case, doubtful, generator
-from exams.hidden.rig import Rig, rig
-from exams.hidden.truth import Truth
+from exams import plain, sit
+from exams.hidden import draw
 from exams.sit import Record
 from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.experiment import Limits
-from gapcert_diagnosis.thresholds import THRESHOLDS
+from gapcert_diagnosis.fitting.fit import Fit, fit, promising
+from gapcert_diagnosis.results import Experiment
+from gapcert_diagnosis.search.candidates import Library
 
-FIXED = ("multisine", "steps", "chirp")
-LEAST = 100  # samples that are played of an input that leaves the limits at once
+Key = tuple[str, str]
 
 
 def experiment(seed: int, index: int, limit: float) -> Record:
-    """The first answer; where it is ambiguous, the answers to it together with each second log."""
-    case = doubtful("experiments", seed, index)
-    asked, log = sit.question(case), case.recording()
-    found: list[gc.Diagnosis] = []
+    """The first answer; where it is ambiguous, the answer to it together with the log of the experiment."""
+    robot = index % 3 == 2
+    nth = index // 3 if robot else index - index // 3
+    case: Any = (draw if robot else plain).doubtful("experiments", seed, nth)
+    asked = _question(case, index)
+    log, horizons = case.recording(), sit.HORIZONS if robot else [case.rig.horizon]
+    # Half of them may go as far the other way as they went one way.
+    limits = _limits(case, log) if index % 2 else {}
+    model, found = sit.model(case.model if robot else case.rig.section), list[gc.Diagnosis]()
 
     def first() -> Record:
-        found.append(sit.diagnosed(case, "all", log))
+        found.append(gc.diagnose(model, log, "all", horizons=horizons, experiment={"limits": limits}))
         return sit.answer(found[0])
 
     record = asked | sit.timed(first, limit)
-    if not found or found[0].verdict != "ambiguous" or found[0].design is None:
+    if not found or found[0].verdict != "ambiguous" or (design := found[0].design) is None:
         return record
-    designed = _designed(case, found[0].design.t, found[0].design.inputs)
-    limits = _limits(case, log)
-    played = {"designed": designed} | {kind: _fixed(case, kind, limits) for kind in FIXED}
-    members = _members(found[0])
-    record |= {"members": sorted(map(list, members)), "equal": sorted(map(list, _equal(case, members, played)))}
-    for name, second in played.items():
-        both = gc.Recording((log.trajectories[0], replace(_recorded(case, second, name), name="experiment")))
-        record[name] = sit.timed(lambda both=both: sit.answer(sit.diagnosed(case, "all", both)), limit)
+    second = _given(case, model, design)
+    again, quiet = (t.trajectories[0] for t in _recorded(second))
+    members = {(c.effect, c.site) for c in found[0].causes} | {k for group in found[0].ambiguous_with for k in group}
+    record |= {"members": sorted(map(list, members))}
+    fitted = log.split({"last": 0.25})[0]
+    record["beyond"] = _beyond(model, fitted, limits, quiet)
+    record["apart"] = _apart(model, fitted, quiet, case.hidden[0].key, found[0])
+    both = gc.Recording((*log.trajectories, replace(again, name="experiment")), hold=log.hold)
+    record["designed"] = sit.timed(lambda: sit.answer(gc.diagnose(model, both, "all", horizons=horizons)), limit)
     return record
 
 
-def _members(found: gc.Diagnosis) -> set[tuple[str, str]]:
-    return {(c.effect, c.site) for c in found.causes} | {k for group in found.ambiguous_with for k in group}
+def _question(case: Any, index: int) -> Record:
+    rig = case.rig
+    name = rig.plant.name
+    asked = {"part": case.part, "seed": case.seed, "index": index, "plant": name, "excitation": rig.excitation}
+    hidden = [{"effect": h.effect, "site": h.site, "numbers": sit.plain(h.numbers)} for h in case.hidden]
+    return asked | {"period": rig.period, "hidden": hidden, "strength": round(case.strength, 2)}
 
 
-def _designed(case: Case, t: Any, inputs: Mapping[str, Any]) -> Rig:
-    """The proposed input, held at the log's own rate."""
-    grid = np.arange(0.0, t[-1] - t[0] + 1e-9, case.rig.period)
-    rows = np.clip(np.searchsorted(t - t[0], grid + 1e-9, side="right") - 1, 0, len(t) - 1)
-    return case.rig.given(np.stack([np.asarray(inputs[name])[rows] for name in case.rig.plant.inputs], axis=1))
+def _given(case: Any, model: gc.Model, design: Experiment) -> Any:
+    """The hidden system under the proposed input, from the proposed start."""
+    u = np.stack([design.inputs[s.name] for s in model.inputs], axis=1)
+    start = {n: v for n, (v, _) in design.start.items()}
+    if isinstance(case, plain.Case):
+        return case.given(u, np.array([start[n] for n in case.rig.plant.states]), start[next(iter(case.rig.plant.inputs))], 10)
+    names = (*case.rig.plant.positions, *case.rig.plant.velocities)
+    return replace(case, rig=replace(case.rig.given(u), start=np.array([start.get(n, 0.0) for n in names])))
 
 
-def _limits(case: Case, log: gc.Recording) -> Limits:
-    """Those of a diagnosis to which nothing is said."""
-    model = sit.model(case.model)
-    return Limits.of(model, Dataset.of(model, log.split({"last": 0.25})[0]))
+def _recorded(second: Any) -> tuple[gc.Recording, gc.Recording]:
+    """(with noise, without)."""
+    if isinstance(second, plain.Case):
+        return second.recording(), replace(second, rig=replace(second.rig, noise=0 * second.rig.noise)).recording()
+    silent = replace(second.noise, sigma=dict.fromkeys(second.noise.sigma, 0.0))
+    return second.recording(salt=10), replace(second, noise=silent).recording(salt=10)
 
 
-def _fixed(case: Case, kind: str, limits: Limits) -> Rig:
-    """A fixed input of the list, as a design would choose its size: where the hidden system stays within the limits longest."""
-    plant, period = case.rig.plant, case.rig.period
-    u = rig(plant.name, kind, period, limits.seconds, generator(f"fixed {kind}", case.seed, case.index)).u
-    low, high = np.array([limits.inputs[n] for n in plant.inputs]).T
-    shape = u / np.maximum(np.abs(u).max(axis=0), 1e-12)
-    names = (*plant.positions, *plant.velocities)
-    columns = [names.index(n) for n in case.noise.sigma]
-    least, most = np.array([limits.outputs[n] for n in case.noise.sigma]).T
-    best, worth = case.rig.given(u), -1.0
-    for size in THRESHOLDS.input_sizes:
-        tried = case.rig.given(size * ((low + high) / 2 + (high - low) / 2 * shape))
-        y = tried.play(case.hidden).x[:, columns]
-        inside = ((y >= least) & (y <= most)).all(axis=1)
-        kept = len(y) if inside.all() else int(np.argmin(inside))
-        if size * kept > worth:
-            best, worth = case.rig.given(tried.u[: max(kept, LEAST)]), size * kept
-    return best
+def _limits(case: Any, log: gc.Recording) -> dict[str, list[float]]:
+    """The range of the recording and its mirror image about rest, of every channel."""
+    if case.rig.plant.name in ("heater", "tank"):
+        return {}
+    reach = {n: float(np.abs(log.trajectories[0].channels[n]).max()) for n in log.names}
+    return {n: [-r, r] for n, r in reach.items()}
 
 
-def _recorded(case: Case, second: Rig, name: str) -> gc.Trajectory:
-    salt = 10 + ("designed", *FIXED).index(name)
-    return replace(case, rig=second).recording(salt=salt).trajectories[0]
+def _beyond(model: gc.Model, log: gc.Recording, given: Mapping[str, Any], quiet: gc.Trajectory) -> float:
+    """By how much of its range a channel leaves the limits, at most."""
+    limits, over = Limits.of(model, Dataset.of(model, log), given), [0.0]
+    for name, (low, high) in {**limits.outputs, **limits.inputs}.items():
+        v = quiet.channels[name]
+        least, most = min(low, float(v[0])), max(high, float(v[0]))
+        over += [(least - v.min()) / (high - low), (v.max() - most) / (high - low)]
+    return round(float(max(over)), 4)
 
 
-def _equal(case: Case, members: set[tuple[str, str]], played: Mapping[str, Rig]) -> set[tuple[str, str]]:
-    """The truth, and the members that fit every one of these logs without noise as well as the truth does."""
-    (hidden,) = case.hidden
-    rng = generator("same", case.seed, case.index)
-    truths = [Truth(second, case.hidden, case.noise.sigma) for second in played.values()]
-    return {hidden.key} | {k for k in members - {hidden.key} if all(t.resembles(hidden, k, rng) for t in truths)}
+def _apart(model: gc.Model, log: gc.Recording, quiet: gc.Trajectory, truth: Key, found: gc.Diagnosis) -> list[Record]:
+    """Of every pair with the truth: what was promised, and what its rival leaves of the log without noise in a joint fit."""
+    both, design = gc.Recording((*log.trajectories, replace(quiet, name="experiment")), hold=log.hold), found.design
+    alone, out = Dataset.of(model, log), []
+    measured = replace(Dataset.of(model, both), sigma=alone.sigma, spread=alone.spread)
+    if design is None or design.window is None or len(found.causes) > 1:
+        return []
+    length = round(design.window / measured.period)
+    for p in design.apart:
+        if truth in (p.one, p.other) and p.separated:
+            rival, promised = (p.other, p.if_one) if truth == p.one else (p.one, p.if_other)
+            out.append({"rival": list(rival), "promised": promised, "found": _left(model, measured, alone, rival, length)})
+    return out
+
+
+def _left(model: gc.Model, both: Dataset, alone: Dataset, key: Key, length: int) -> float:
+    """RMS of the experiment's residual in noise floors, with one effect fitted to both logs, from its best fit to the first."""
+    library = Library(model, alone, [gc.registry().build("effect", key[0])])
+    c = next(c for c in library.candidates if c.key == key)
+    h, starts, windows = library.hypothesis((c,)), library.starts(c), alone.windows(length)
+    rows = np.tile(h.value, (len(starts), 1))
+    rows[:, [h.names.index(n) for n in library.names(c)]] = starts
+    theta, start, _ = promising(h, windows, rows, windows.start)
+    first = fit(h, windows, theta=theta, start=start)
+    windows = both.windows(length)
+    again: Fit = fit(h, windows, theta=first.theta, iterations=15)
+    of = np.array([both.source[i] == max(both.source) for i in windows.place[:, 0]])
+    return float(np.sqrt(np.mean(again.residual[of] ** 2)))

@@ -65,15 +65,15 @@ def exact(r: Record) -> bool:
 
 
 def open_question(r: Record) -> bool:
-    """Is the truth among the members of an ambiguous answer, beside one that some input tells from it?"""
-    members, equal = (set(map(tuple, r[k])) for k in ("members", "equal"))
-    return truth(r) in members and bool(members - equal)
+    """Is the truth among the members of an ambiguous answer, and was it promised that the experiment separates it from one?"""
+    return bool(r.get("apart")) and list(truth(r)) in r["members"]
 
 
 def resolved(r: Record) -> bool:
-    """Does the answer name the truth, or what no input tells from it, and nothing else?"""
-    said = set(named(r)) | {(k[0], k[1]) for group in r.get("ambiguous_with", []) for k in group}
-    return bool(said) and r["verdict"] in NAMED and said <= {(k[0], k[1]) for k in r["equal"]}
+    """Does the answer to both logs name the truth, or what was said to stay alike, and nothing from which it was to be told?"""
+    after = r["designed"]
+    said = set(named(after)) | {(k[0], k[1]) for group in after.get("ambiguous_with", []) for k in group}
+    return truth(r) in said and not said & {(p["rival"][0], p["rival"][1]) for p in r["apart"]}
 
 
 def in_class(r: Record) -> bool:

@@ -247,8 +247,9 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
     gain = {f"{j.horizon:g}": j.gains(answer.nothing, answer.fit, seed) for j in judges}
     lap("gain")
     dataset, asked = answer.dataset, problem.experiment
-    limits = Limits.of(data.library.model, dataset, asked.get("limits"), asked.get("seconds", 12.0))
-    design, _ = spared("experiment", (None, ()), told_apart, answer.causes, answer.fit, answer.ties, dataset, limits, seed)
+    limits = Limits.of(data.library.model, dataset, asked.get("limits"), asked.get("seconds"))
+    told = answer.causes, answer.fit, answer.ties, dataset, limits, seed
+    design, separable, besides = spared("experiment", (None, (), {}), told_apart, *told)
     lap("experiment")
     left = leftover.left(data.library.extended(answer.causes, answer.fit.values), answer.fit, seed)
     doubted = doubt(answer.fit)
@@ -276,7 +277,7 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
         gain,
         _extended(answer, pushed if calm and len(problem.recording.trajectories) == 1 else ()),
         tuple(ties),
-        _experiment(answer, design is not None),
+        _experiment(answer, separable, besides),
         rest,
         spared("pictures", None, figure, answer.search, answer.causes, answer.fit, judge, design, correction, first),
         design=design,
@@ -597,13 +598,17 @@ def _misfits(answer: Answer) -> dict[str, Misfit]:
     return {c.name: Misfit(*map(float, row)) for c, *row in zip(m.channels, old, new, m.sigma, strict=True)}
 
 
-def _experiment(answer: Answer, separable: bool) -> str | None:
-    """What would tell the first tie apart; of what no input separates, what to measure besides, where sites differ."""
-    for tie, _ in answer.ties:
-        a, b = without(answer.causes, tie)[0], without(tie, answer.causes)[0]
+def _experiment(answer: Answer, separable: Sequence[bool], besides: Mapping[int, str]) -> str | None:
+    """What would tell the first tie apart that no input separates, and what to measure besides; else what tells the first."""
+    pairs = list(itertools.combinations([answer.causes, *(t for t, _ in answer.ties)], 2))
+    open_ = [i for i, yes in enumerate(separable) if not yes] or [0]
+    for i in open_ if answer.ties else ():
+        a, b = ((without(*p) or p[0])[0] for p in (pairs[i], pairs[i][::-1]))
         known = a.effect.rivals.get(b.told[0]) or b.effect.rivals.get(a.told[0])
         text = known or f"{a.effect.experiment}; {b.effect.experiment}"
-        if not separable and a.site != b.site:
+        if not (separable and separable[i]) and a.site != b.site:
             text = f"measure {', or '.join(_MEASURED.get(c.effect.site, '{} by itself').format(c.site) for c in (a, b))}"
+        if i in besides:
+            text = besides[i] if a.site == b.site else f"{text}; or {besides[i]}"
         return f"to tell {a.told[0]} at {a.site} from {b.told[0]} at {b.site}: {text}"
     return None

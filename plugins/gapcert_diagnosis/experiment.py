@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, final
 
 import numpy as np
 
 from gapcert.plugin import Array, Model, Recording, UsageError, difference, magnitude
 
-from .data.dataset import Dataset, Windows, flat
+from .data.dataset import Dataset, Windows, driven, flat
 from .fitting.fit import Fit, fit, nearby
 from .fitting.hypothesis import between, memories, shows_memory
-from .results import Experiment
+from .results import Apart, Experiment, Travel
 from .search.candidates import Causes
 from .thresholds import THRESHOLDS
 
 LIMITS = ("diagnose", "experiment", "limits")  # where a spec says them
 BANDS = {"a slow swing": (0.08, 0.4), "a slow multisine": (0.2, 1.5), "a multisine": (0.3, 4.0),
          "a fast multisine": (3.0, 12.0), "a very fast multisine": (12.0, 30.0)}  # fmt: skip
+BEYOND = ("a slow multisine", "a multisine", "slow steps")  # what is tried where no input within the limits tells
+GENTLE = ("a slow swing", "a multisine", "slow steps", "a creeping ramp")
 BACK = ("a slow swing", "a slow multisine", "a multisine", "a fast multisine", "steps", "slow steps", "switching")
 
 
@@ -38,15 +41,23 @@ class Rivalry:
 @final
 @dataclass(frozen=True)
 class Limits:
-    """What an experiment may do: [low, high] of every input and of every measured output, and its length in s."""
+    """What an experiment may do: [low, high] of every input and of every measured output, and its length in s.
+
+    wider: of each output, how many times as wide as in the data; its speed may grow as much.
+    """
 
     inputs: Mapping[str, tuple[float, float]]
     outputs: Mapping[str, tuple[float, float]]
     seconds: float
+    wider: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, model: Model, measured: Dataset, given: Mapping[str, Any] | None = None, seconds: float = 12.0) -> Limits:
-        """Where nothing is given: inputs as in the data, or off; outputs as in the data. Texts may carry units."""
+    def of(
+        cls, model: Model, measured: Dataset, given: Mapping[str, Any] | None = None, seconds: float | None = None
+    ) -> Limits:
+        """Where nothing is given: inputs as in the data, or off; outputs as in the data; 12 s or some turns of the motion, as
+        far as the data are as long. Texts may carry units.
+        """
         asked = {}
         units = {s.name: s.unit for s in (*model.inputs, *measured.channels)}
         for name, pair in (given or {}).items():
@@ -65,7 +76,12 @@ class Limits:
         u, y = np.concatenate(measured.inputs), np.concatenate(measured.outputs)
         inputs = {s.name: _range(np.append(u[:, i], np.zeros(len(u) // 100 + 1))) for i, s in enumerate(model.inputs)}
         outputs = {s.name: _range(y[:, i]) for i, s in enumerate(measured.channels)}
-        return cls({n: asked.get(n, r) for n, r in inputs.items()}, {n: asked.get(n, r) for n, r in outputs.items()}, seconds)
+        if seconds is None:
+            long = max(THRESHOLDS.least_experiment, THRESHOLDS.experiment_turns / _beat(measured))
+            seconds = min(long, sum(map(len, measured.times)) * measured.period)
+        wider = {n: max(1.0, np.ptp(asked.get(n, r)) / max(r[1] - r[0], 1e-300)) for n, r in outputs.items()}
+        inputs, outputs = ({n: asked.get(n, r) for n, r in ranges.items()} for ranges in (inputs, outputs))
+        return cls(inputs, outputs, seconds, wider)
 
 
 def _range(values: Array) -> tuple[float, float]:
@@ -75,28 +91,36 @@ def _range(values: Array) -> tuple[float, float]:
 
 def design(
     pairs: Sequence[Rivalry], measured: Dataset, limits: Limits, length: int, seed: int = 0
-) -> tuple[Experiment | None, tuple[bool, ...]]:
-    """The input from which the pair that it separates least gains most, and which pairs can be separated at all.
+) -> tuple[Experiment | None, tuple[bool, ...], dict[int, str]]:
+    """The input from which the pair that it separates least gains most, which pairs can be separated at all, and by its number
+    what would separate each of the others, in words, where that can be computed.
 
     length: of a window in samples. For every input one rival is simulated, and the other refitted to it with starts,
     nuisances and its own numbers free as far as the data leave them free; what it cannot copy counts, in both directions.
     """
     if not pairs or not limits.inputs:
-        return None, tuple(False for _ in pairs)
-    fits = [f for k, pair in enumerate(pairs) for f in ((pair.here, pair.there) if k == 0 else (pair.there,))]
-    allowed = _within(fits, shapes(limits.inputs, limits.seconds, measured, seed), measured, limits, 2 * length)
-    trials = [_Trial(pair, allowed, measured, length) for pair in pairs]
+        return None, tuple(False for _ in pairs), {}
+    fits = list({id(f): f for pair in pairs for f in (pair.here, pair.there)}.values())
+    begin, held = _rest(fits, measured, limits)
+    plays = {id(f): _Plays(f, measured, begin, held) for f in fits}
+    allowed = _within(list(plays.values()), shapes(limits.inputs, limits.seconds, measured, seed, held), limits, 2 * length)
+    trials = [_Trial(pair, allowed, plays, length) for pair in pairs]
     best = [t.best(t.table) for t in trials]
     separable = tuple(
         name is not None and t.table[name].expected > THRESHOLDS.settled_fall for t, name in zip(trials, best, strict=True)
     )
+    most = np.abs(np.concatenate(measured.inputs)).max(axis=0)
+    far = {n: max(*map(abs, pair), m) for (n, pair), m in zip(limits.inputs.items(), most.tolist(), strict=True)}
+    away = {n: (-a, a) for n, a in far.items()}
+    wide = [shapes(to, limits.seconds, measured, seed, held)[n] for to in (limits.inputs, away) for n in BEYOND]
+    besides = {i: text for i, t in enumerate(trials) if not separable[i] and (text := t.besides(wide))}
     if not any(separable):
-        return None, separable
+        return None, separable, besides
     able = [t for t, yes in zip(trials, separable, strict=True) if yes]
     name = _common(able)
     # Where no input is played for all of them, the pair that is hardest decides.
     hardest = min(able, key=lambda t: t.table[name].value if name else max(s.value for s in t.table.values()))
-    return _experiment(hardest, name or hardest.best(hardest.table) or "", measured), separable
+    return _experiment(hardest, name or hardest.best(hardest.table) or "", trials), separable, besides
 
 
 def _common(trials: Sequence[_Trial]) -> str | None:
@@ -110,13 +134,13 @@ def _common(trials: Sequence[_Trial]) -> str | None:
 
 def told_apart(
     causes: Causes, last: Fit, ties: Sequence[tuple[Causes, Fit]], measured: Dataset, limits: Limits, seed: int = 0
-) -> tuple[Experiment | None, tuple[bool, ...]]:
-    """`design` for a set of causes and the other sets that explain the data as well."""
+) -> tuple[Experiment | None, tuple[bool, ...], dict[int, str]]:
+    """`design` for every two of a set of causes and the others that explain the data as well; pairs with the causes first."""
     pairs = []
-    for tie, fitted in ties:
-        mine, other = {c.told for c in causes}, {c.told for c in tie}
+    for (one, here), (tie, there) in itertools.combinations([(causes, last), *ties], 2):
+        mine, other = {c.told for c in one}, {c.told for c in tie}
         a, b = next(iter(sorted(mine - other)), min(mine)), next(iter(sorted(other - mine)), min(other))
-        pairs.append(Rivalry(a, b, last, fitted))
+        pairs.append(Rivalry(a, b, here, there))
     return design(pairs, measured, limits, last.residual.shape[1], seed)
 
 
@@ -133,6 +157,8 @@ class _Separation:
     def of(cls, u: Array, left: Sequence[Array], pair: Rivalry) -> _Separation:
         """From what cannot be copied, (W, L, ny), in each direction. Coloured noise counts for less."""
         whiteness = np.minimum(pair.here.whiteness, pair.there.whiteness)
+        if len(whiteness) < left[0].shape[2]:
+            whiteness = np.full(left[0].shape[2], whiteness.min())
         falls = [float(np.sum(r**2, axis=(0, 1)) @ whiteness) for r in left]
         rms = [float(np.sqrt(np.mean(r**2))) for r in left]
         return cls(u, (rms[0], rms[1]), (falls[0], falls[1]))
@@ -145,6 +171,11 @@ class _Separation:
     @property
     def expected(self) -> float:
         return max(self.falls)
+
+    @property
+    def settles(self) -> bool:
+        """Does it say which is right, whichever is? Of two of which one contains the other, by what the larger alone does."""
+        return (max(self.falls) if self.nested else min(self.falls)) > THRESHOLDS.settled_fall
 
     @property
     def told(self) -> float:
@@ -160,23 +191,64 @@ class _Separation:
 class _Trial:
     """A pair of rivals under every input: all of them to first order, the best of them by fits to both logs."""
 
-    def __init__(self, pair: Rivalry, inputs: Mapping[str, Array], measured: Dataset, length: int) -> None:
-        self.pair, self.measured, self.length = pair, measured, length
+    def __init__(self, pair: Rivalry, inputs: Mapping[str, Array], plays: Mapping[int, _Plays], length: int) -> None:
+        self.pair, self.length = pair, length
+        self.plays = plays[id(pair.here)], plays[id(pair.there)]
+        self.measured, self.plays_all = self.plays[0].measured, tuple(plays.values())
         self.table: dict[str, _Separation] = {}
         self._full: set[str] = set()
         for name, u in inputs.items():
-            logs = [_log(f, u, measured) for f in (pair.here, pair.there)]
-            both = [_first_order(b, log.windows(length)) for b, log in zip((pair.there, pair.here), logs, strict=True) if log]
-            if len(both) == 2:
-                self.table[name] = _Separation.of(u, both, pair)
-        self.judge(sorted(self.table, key=lambda n: -self.table[n].value)[: THRESHOLDS.judged_inputs])
+            if (found := self._looked(u, [p.log(u) for p in self.plays])) is not None:
+                self.table[name] = found
+        # What looks best to first order may be less by full fits: until the best is one that has been judged so.
+        for _ in range(THRESHOLDS.most_judged):
+            self.judge([n for n in [self.best(self.table)] if n is not None])
+
+    def _looked(self, u: Array, logs: Sequence[Dataset | None]) -> _Separation | None:
+        """To first order."""
+        turns = zip((self.pair.there, self.pair.here), logs, strict=True)
+        both = [_first_order(b, log.windows(self.length)) for b, log in turns if log]
+        return _Separation.of(u, both, self.pair) if len(both) == 2 else None
+
+    def besides(self, beyond: Sequence[Array]) -> str:
+        """What would separate a pair that no input does: an output of the model that is not measured, inputs beyond the limits,
+        or more samples; "" where none of these does.
+        """
+        m, model = self.measured, self.pair.here.hypothesis.model
+        named = sorted(self.table, key=lambda n: -self.table[n].value)[: THRESHOLDS.judged_inputs]
+        for i in (i for i in range(len(model.outputs)) if i not in m.columns):
+            more = [p.showing(i) for p in self.plays]
+            if any(self._settles(self.table[n].u, more) for n in named):
+                share = f"{100 * THRESHOLDS.further_noise:g} % of its deviation"
+                return f"measure {model.outputs[i].name} as well, with noise of {share} or less"
+        for u in beyond:
+            if self._settles(u, self.plays):  # with no regard to how far and how fast outputs go
+                y = np.concatenate([p.outputs(u[None])[0] for p in self.plays])
+                ways = [f"{s.name} go from {_span(u[:, i], s.unit)}" for i, s in enumerate(model.inputs)]
+                ways += [f"{s.name} from {_span(y[:, i], s.unit)}" for i, s in enumerate(m.channels)]
+                return f"where the machine may, let {' and '.join(ways)} (diagnose.experiment.limits)"
+        few = [self.table[n] for n in named[:1]]
+        alike = self.pair.here.hypothesis.charged == self.pair.there.hypothesis.charged
+        for most, u in [(min(s.falls) if alike else s.expected, s.u) for s in few]:
+            if most * THRESHOLDS.longer_experiment > THRESHOLDS.settled_fall:
+                times = math.ceil(2 * THRESHOLDS.settled_fall / most)
+                long = f"{times * len(u) * m.period:.3g} s of {named[0]} (diagnose.experiment.seconds)"
+                return f"play {long}, or take {times} times as many samples in the same time"
+        return ""
+
+    def _settles(self, u: Array, plays: Sequence[_Plays]) -> bool:
+        found = self._looked(u, [p.log(u) for p in plays])
+        return found is not None and found.expected > THRESHOLDS.settled_fall
 
     def judge(self, names: Sequence[str]) -> None:
         """By full fits."""
         pair, turns = self.pair, ((self.pair.here, self.pair.there), (self.pair.there, self.pair.here))
         for name in (n for n in names if n not in self._full):
             u = self.table[name].u
-            both = [_copied(rival, self.measured, _log(truth, u, self.measured), self.length) for truth, rival in turns]
+            both = [
+                _copied(rival, self.measured, play.log(u), self.length)
+                for play, (_, rival) in zip(self.plays, turns, strict=True)
+            ]
             self.table[name] = _Separation.of(u, both, pair)
             self._full.add(name)
 
@@ -184,65 +256,175 @@ class _Trial:
         return max(names, key=lambda n: self.table[n].value, default=None)
 
 
-def _within(
-    fits: Sequence[Fit], signals: Mapping[str, Array], measured: Dataset, limits: Limits, least: int
-) -> dict[str, Array]:
-    """Name → u (T, nu): each input at the size whose beginning, within the limits under every fit, times the size is longest.
+def _rest(fits: Sequence[Fit], measured: Dataset, limits: Limits) -> tuple[Array, Array]:
+    """State (nx,) and held input (nu,) from which an experiment begins: of where the recording was, with rates set to zero,
+    what moves little by every fit, away from the ends of what is allowed, under the least input.
+    """
+    model, apart = fits[0].hypothesis.model, -(-sum(map(len, measured.times)) // THRESHOLDS.starts_tried)
+    seen, told = (np.concatenate(parts)[::apart] for parts in (measured.states, measured.inputs))
+    ranges = [np.array(list(pairs.values()), dtype=float).T for pairs in (limits.inputs, limits.outputs)]
+    off, width = np.clip(0.0, *ranges[0]), np.maximum(np.ptp(seen, axis=0), 1e-300)
+    states = np.concatenate(
+        [measured.states[0][:1], np.clip(np.zeros((1, model.nx)), seen.min(axis=0), seen.max(axis=0)), seen]
+    )
+    states[:, [j for _, j in driven(model)]] = 0.0
+    x, u = np.concatenate([states, states[2:]]), np.concatenate([np.tile(off, (len(states), 1)), told])
+    u = np.clip(u, *ranges[0])
+    with np.errstate(all="ignore"):
+        y = model.output(x, u, _values(fits[0]))[:, measured.columns]
+        moved = np.zeros(len(x))
+        for f in fits:
+            hidden, now = _memory(f, x, u, measured), np.repeat(u[:, None], measured.repeat, axis=1)
+            ahead = f.hypothesis.model.fast_rollout(x, now, parameters=_values(f), hidden=hidden).x[:, -1]
+            each = np.abs(difference(model.states, ahead, x)) / width
+            moved = np.maximum(moved, np.nan_to_num(each, nan=np.inf).max(axis=1))
+    usual = np.median(np.abs(np.diff(np.concatenate(measured.states), axis=0) / width).max(axis=1))
+    ends = np.minimum(y - ranges[1][0], ranges[1][1] - y) / (ranges[1][1] - ranges[1][0])
+    short = np.round(np.maximum(THRESHOLDS.free_ends - ends.min(axis=1), 0.0), 2)
+    loud = moved > max(2 * float(moved.min()), THRESHOLDS.at_rest * float(usual))
+    effort = np.abs((u - off) / np.maximum(ranges[0][1] - ranges[0][0], 1e-300)).sum(axis=1)
+    best = int(np.lexsort([moved, effort, short, loud])[0])
+    return x[best], u[best]
+
+
+def _memory(fitted: Fit, x: Array, u: Array, measured: Dataset) -> Array | None:
+    """What is remembered (n, nh) of inputs u (n, nu) that were held for long, where a model remembers."""
+    model = fitted.hypothesis.model
+    if not model.hidden:
+        return None
+    before = np.repeat(u[:, None], max(map(len, measured.times)) * measured.repeat, axis=1)
+    with np.errstate(all="ignore"):
+        return model.fast_rollout(x, before, parameters=_values(fitted), every=before.shape[1]).hidden
+
+
+def _span(values: Array, unit: str) -> str:
+    return f"{values.min():.3g} to {values.max():.3g}{'' if unit in ('', '1') else f' {unit}'}"
+
+
+def _values(fitted: Fit) -> dict[str, float] | None:
+    return {**fitted.hypothesis.fixed, **fitted.values} or None
+
+
+@final
+class _Plays:
+    """A fitted model as it is played to from a start (nx,) under an input (nu,) that was held: what is measured, and what would
+    be recorded without noise.
+    """
+
+    def __init__(self, fitted: Fit, measured: Dataset, begin: Array, held: Array) -> None:
+        self.fitted, self.measured, self.begin, self.held = fitted, measured, begin, held
+        self._hidden = _memory(fitted, begin[None], held[None], measured)
+        self._logs: dict[int, tuple[Array, Dataset | None]] = {}
+
+    def showing(self, column: int) -> _Plays:
+        """With one more output of the model measured."""
+        m, model = self.measured, self.fitted.hypothesis.model
+        more = replace(m, channels=(*m.channels, model.outputs[column]), columns=(*m.columns, column))
+        return _Plays(self.fitted, more, self.begin, self.held)
+
+    def states(self, u: Array) -> Array:
+        """(n, T, nx) under u (n, T, nu)."""
+        fine, x0 = np.repeat(u, self.measured.repeat, axis=1), np.tile(self.begin, (len(u), 1))
+        with np.errstate(all="ignore"):
+            hidden = None if self._hidden is None else np.tile(self._hidden, (len(u), 1))
+            x = self.fitted.hypothesis.model.fast_rollout(x0, fine, parameters=_values(self.fitted), hidden=hidden).x
+        return np.asarray(x[:, : -1 : self.measured.repeat])
+
+    def outputs(self, u: Array) -> Array:
+        """Measured channels (n, T, ny) under u (n, T, nu). What comes late shows the start until then."""
+        m, model, values = self.measured, self.fitted.hypothesis.model, _values(self.fitted)
+        with np.errstate(all="ignore"):
+            x, sent, known = self.states(u), u, None
+            if (arriving := model.input_delays(values)).any():
+                past = np.floor(np.arange(u.shape[1])[:, None] - arriving / m.period + THRESHOLDS.whole_sample)[None]
+                sent = np.where(past < 0, self.held, np.take_along_axis(u, np.maximum(past, 0).astype(np.intp), axis=1))
+            if self._hidden is not None and shows_memory(model):
+                fine = np.repeat(u, m.repeat, axis=1)[:, : (u.shape[1] - 1) * m.repeat]
+                known = flat(memories(model, x, fine, values or {}, np.tile(self._hidden, (len(u), 1)), m.repeat))
+            y = model.output(flat(x), flat(sent), values, known)[:, m.columns].reshape(len(u), u.shape[1], -1)
+            late = model.output_delays(values)[..., m.columns] / m.period
+            ahead = np.maximum(-late, -np.arange(u.shape[1])[:, None])
+            return between(y[None], ahead)[0] if late.any() else y
+
+    def log(self, u: Array) -> Dataset | None:
+        """What would be recorded; None where nothing moves."""
+        if id(u) not in self._logs:
+            self._logs[id(u)] = u, self._log(u)
+        return self._logs[id(u)][1]
+
+    def _log(self, u: Array) -> Dataset | None:
+        m, model, y = self.measured, self.fitted.hypothesis.model, self.outputs(u[None])[0]
+        known = len(m.spread)
+        if not np.isfinite(y).all() or (np.ptp(y, axis=0)[:known] < 1e-9 * m.spread).any() or not np.ptp(y, axis=0).all():
+            return None
+        channels = {c.name: y[:, i] for i, c in enumerate(m.channels)}
+        channels |= {s.name: u[:, i] for i, s in enumerate(model.inputs)}
+        found = Dataset.of(model, Recording.of(np.asarray(np.arange(len(u)) * m.period), channels))
+        order = [[c.name for c in found.channels].index(c.name) for c in m.channels]
+        own = np.std(y, axis=0)[known:]
+        floor, spread = np.append(m.sigma, THRESHOLDS.further_noise * own), np.append(m.spread, own)
+        back = np.argsort(order)
+        # An experiment is played sample by sample, whatever the recording was.
+        return replace(found, sigma=floor[back], spread=spread[back], hold="zero")
+
+
+def _speed(y: Array, measured: Dataset) -> Array:
+    """How fast outputs (…, T, ny) change at most, (ny,), per s."""
+    rows = np.abs(np.diff(y, axis=-2)).reshape(-1, y.shape[-1])
+    return np.asarray(np.nan_to_num(rows, posinf=np.inf).max(axis=0) / measured.period)
+
+
+def recorded_speed(fits: Sequence[Fit], measured: Dataset) -> Array:
+    """How fast each measured channel was in the recording, (ny,), per s, as the quickest of the fits has it."""
+    moved = [f.hypothesis.simulate(f.windows, f.theta[None], f.start[None])[0] for f in fits]
+    return np.asarray(np.max([_speed(y, measured) for y in moved], axis=0))
+
+
+def _within(plays: Sequence[_Plays], signals: Mapping[str, Array], limits: Limits, least: int) -> dict[str, Array]:
+    """Name → u (T, nu): each input at the size whose beginning, within the limits under every fit, times the size is longest,
+    and then back to what was held.
 
     An input of which less than `least` samples can be played is left out.
     """
-    low, high = (np.array([limits.outputs[c.name][i] for c in measured.channels]) for i in (0, 1))
-    middle = np.array([0.0 if a <= 0 <= b else (a + b) / 2 for a, b in limits.inputs.values()])
+    measured = plays[0].measured
+    names = [c.name for c in measured.channels]
+    low, high = (np.array([limits.outputs[n][i] for n in names]) for i in (0, 1))
+    # No fit is the machine: some room is left, but where it begins is allowed.
+    room = THRESHOLDS.experiment_room * (high - low)
+    held = plays[0].held
+    begin = [p.outputs(held[None, None])[0, 0] for p in plays]
+    low, high = np.min([low + room, *begin], axis=0), np.max([high - room, *begin], axis=0)
+    fastest = recorded_speed([p.fitted for p in plays], measured) * [limits.wider.get(n, 1.0) for n in names] * measured.period
+
+    def inside(u: Array) -> Array:
+        """How many samples of each of u (n, T, nu) can be played."""
+        good = np.ones(u.shape[:2], dtype=bool)
+        for p in plays:
+            y = p.outputs(u)
+            good &= ((y >= low) & (y <= high)).all(axis=2)
+            good[:, 1:] &= (np.abs(np.diff(y, axis=1)) <= fastest).all(axis=2)
+        return np.asarray(np.cumprod(good, axis=1).sum(axis=1))
+
     longest: dict[str, Array] = {}
     worth: dict[str, float] = {}
     for size in THRESHOLDS.input_sizes:
-        names = [n for n in signals if worth.get(n, 0.0) < size * len(signals[n])]
-        if not names:
+        tried = [n for n in signals if worth.get(n, 0.0) < size * len(signals[n])]
+        if not tried:
             break
-        u = np.stack([middle + size * (signals[n] - middle) for n in names])
-        inside = np.ones(u.shape[:2], dtype=bool)
-        for f in fits:
-            y = _played(f, u, measured)
-            inside &= ((y >= low) & (y <= high)).all(axis=2)
-        for n, row, kept in zip(names, u, np.cumprod(inside, axis=1).sum(axis=1).tolist(), strict=True):
-            if kept >= least and size * kept > worth.get(n, 0.0):
-                longest[n], worth[n] = row[:kept], size * kept
+        u = np.stack([held + size * (signals[n] - held) for n in tried])
+        for n, row, kept in zip(tried, u, inside(u).tolist(), strict=True):
+            # It may not end at full speed near an end: back to what is held, for so long that this is seen.
+            back = math.ceil(THRESHOLDS.experiment_tail * len(row))
+            kept = min(kept, len(row) - back)
+            cuts = [k for k in (int(kept * part) for part in THRESHOLDS.experiment_cuts) if k >= least]
+            if not cuts or size * (kept + back) <= worth.get(n, 0.0):
+                continue
+            fall = np.maximum(1 - 2 * np.arange(back) / back, 0.0)[:, None]
+            ended = np.stack([np.concatenate([row[:k], held + fall * (row[k - 1] - held), row[k:] * 0 + held]) for k in cuts])
+            whole = [k + back for k, far in zip(cuts, inside(ended).tolist(), strict=True) if far >= k + back]
+            if whole and size * whole[0] > worth.get(n, 0.0):
+                longest[n], worth[n] = ended[cuts.index(whole[0] - back), : whole[0]], size * whole[0]
     return longest
-
-
-def _played(fitted: Fit, u: Array, measured: Dataset) -> Array:
-    """Measured channels (n, T, ny) of the fitted model under u (n, T, nu), from where the first recording started.
-
-    What comes late shows that start until then.
-    """
-    h, n, repeat = fitted.hypothesis, len(u), measured.repeat
-    values = {**h.fixed, **fitted.values}
-    fine = np.repeat(u, repeat, axis=1)
-    x0 = np.tile(measured.states[0][0], (n, 1))
-    with np.errstate(all="ignore"):
-        x = h.model.fast_rollout(x0, fine, parameters=values or None).x[:, :-1:repeat]
-        past = np.floor(np.arange(u.shape[1])[:, None] - h.model.input_delays(values or None) / measured.period + 1e-6)
-        sent, known = np.take_along_axis(u, np.maximum(past, 0).astype(np.intp)[None], axis=1), None
-        if shows_memory(h.model):
-            begun = np.tile(h.model.hidden_default, (n, 1))
-            known = flat(memories(h.model, x, fine[:, : (u.shape[1] - 1) * repeat], values, begun, repeat))
-        shown = h.model.output(flat(x), flat(sent), values or None, known)
-        y = shown[:, measured.columns].reshape(n, u.shape[1], -1)
-        late = h.model.output_delays(values or None)[..., measured.columns] / measured.period
-        ahead = np.maximum(-late, -np.arange(u.shape[1])[:, None])
-        return between(y[None], ahead)[0] if late.any() else y
-
-
-def _log(fitted: Fit, u: Array, measured: Dataset) -> Dataset | None:
-    """What would be recorded without noise; None where nothing moves."""
-    y = _played(fitted, u[None], measured)[0]
-    if not np.isfinite(y).all() or (np.ptp(y, axis=0) < 1e-9 * measured.spread).any():
-        return None
-    channels = {c.name: y[:, i] for i, c in enumerate(measured.channels)}
-    channels |= {s.name: u[:, i] for i, s in enumerate(fitted.hypothesis.model.inputs)}
-    found = Dataset.of(fitted.hypothesis.model, Recording.of(np.asarray(np.arange(len(u)) * measured.period), channels))
-    # An experiment is played sample by sample, whatever the recording was.
-    return replace(found, sigma=measured.sigma, spread=measured.spread, hold="zero")
 
 
 def _first_order(rival: Fit, windows: Windows) -> Array:
@@ -284,32 +466,52 @@ def joined(first: Dataset, second: Dataset) -> Dataset:
     return replace(first, **both, drives=drives, source=source)
 
 
-def _experiment(trial: _Trial, name: str, measured: Dataset) -> Experiment:
-    pair, table = trial.pair, trial.table
+def _experiment(trial: _Trial, name: str, trials: Sequence[_Trial]) -> Experiment:
+    pair, table, measured, model = trial.pair, trial.table, trial.measured, trial.pair.here.hypothesis.model
+    for other in trials:
+        other.judge([name] if name in other.table else [])
     chosen = table[name]
-    inputs = {s.name: chosen.u[:, i] for i, s in enumerate(pair.here.hypothesis.model.inputs)}
+    t = np.asarray(np.arange(len(chosen.u)) * measured.period)
+    inputs = {s.name: chosen.u[:, i] for i, s in enumerate(model.inputs)}
     (a, b), (c, d) = pair.named, pair.other
-    far, y = chosen.told, np.concatenate([_played(f, chosen.u[None], measured)[0] for f in (pair.here, pair.there)])
+    apart = tuple(
+        Apart(o.pair.named, o.pair.other, *o.table[name].rms, o.table[name].settles) for o in trials if name in o.table
+    )
+    moved = np.concatenate([p.outputs(chosen.u[None]) for p in trial.plays_all])
+    fits = [p.fitted for p in trial.plays_all]
     # What decays towards rest is told as rest.
-    ends = np.where(np.abs(y) < measured.sigma, 0.0, y)
-    travel = {s.name: (float(ends[:, i].min()), float(ends[:, i].max()), s.unit) for i, s in enumerate(measured.channels)}
+    ends, fast = np.where(np.abs(moved) < measured.sigma, 0.0, moved), _speed(moved, measured)
+    known = recorded_speed(fits, measured)
+    before = [_range(np.concatenate(measured.outputs)[:, i]) for i in range(len(known))]
+    travel = {
+        s.name: Travel(float(ends[..., i].min()), float(ends[..., i].max()), s.unit, float(fast[i]), before[i], float(known[i]))
+        for i, s in enumerate(measured.channels)
+    }
     sentence = (
-        f"to tell {a} at {b} from {c} at {d}: play {name} for {len(chosen.u) * measured.period:.3g} s; "
-        f"their predictions then differ by {far:.2g} times the noise, by {math.sqrt(chosen.expected):.2g} sigma in all"
+        f"to tell {a} at {b} from {c} at {d}: play {name} for {t[-1]:.3g} s; "
+        f"their predictions then differ by {chosen.told:.2g} times the noise, by {math.sqrt(chosen.expected):.2g} sigma in all"
     )
     others = {n: s.told for n, s in table.items() if n != name}
-    t = np.asarray(np.arange(len(chosen.u)) * measured.period)
-    return Experiment((pair.named, pair.other), name, sentence, t, inputs, far, others, travel)
+    begin = [*trial.plays[0].begin.tolist(), *trial.plays[0].held.tolist()]
+    start = {s.name: (v, s.unit) for s, v in zip((*model.states, *model.inputs), begin, strict=True)}
+    predicted = {s.name: moved[..., i] for i, s in enumerate(measured.channels)}
+    rivals, window = (pair.named, pair.other), trial.length * measured.period
+    return Experiment(rivals, name, sentence, t, inputs, chosen.told, others, travel, apart, start, predicted, window)
 
 
-def shapes(limits: Mapping[str, tuple[float, float]], seconds: float, measured: Dataset, seed: int) -> dict[str, Array]:
-    """Name → u (T, nu): every input at once, each with phases and levels of its own; frequencies in units of the motion's."""
+def shapes(
+    limits: Mapping[str, tuple[float, float]], seconds: float, measured: Dataset, seed: int, held: Array | None = None
+) -> dict[str, Array]:
+    """Name → u (T, nu): every input at once, each with phases and levels of its own; frequencies in units of the motion's.
+
+    held (nu,): where gentle ones begin, by default off.
+    """
     period, count = measured.period, measured.samples(seconds)
     t, beat = np.arange(count) * period, _beat(measured)
     most = THRESHOLDS.fastest_input / period
     low, high = (np.array([pair[i] for pair in limits.values()]) for i in (0, 1))
     middle, half = (low + high) / 2, (high - low) / 2
-    rest = np.clip(0.0, low, high)
+    rest = np.clip(0.0, low, high) if held is None else held
     rng = np.random.default_rng(seed)
 
     def sines(band: tuple[float, float]) -> Array:
@@ -337,13 +539,13 @@ def shapes(limits: Mapping[str, tuple[float, float]], seconds: float, measured: 
     }
     unit["a chirp"] = every(np.sin(2 * np.pi * (0.1 * beat * t + (turn - 0.1 * beat) * t**2 / (2 * seconds))))
     unit["a creeping ramp"] = every(1 - 4 * np.abs((t / seconds + 0.25) % 1 - 0.5))
-    unit |= {
-        f"{name}, small": THRESHOLDS.small_input * unit[name]
-        for name in ("a slow swing", "a multisine", "slow steps", "a creeping ramp")
-    }
+    unit |= {f"{name}, small": THRESHOLDS.small_input * unit[name] for name in GENTLE}
     # What drifts comes back: a double integrator ends at rest where it began.
     unit |= {f"{name}, there and back": _returning(unit[name]) for name in BACK}
     out = {name: middle + half * shape for name, shape in unit.items()}
+    # A first jump alone may be quicker than anything recorded.
+    rise = np.minimum(t / (THRESHOLDS.gentle_rise * seconds), 1.0)[:, None]
+    out |= {f"{name}, begun gently": rest + rise * (out[name] - rest) for name in GENTLE}
     # One push, then nothing: what is left decays freely, four times.
     phase = (t % (seconds / 4)) / (seconds / 4)
     kick = np.where(phase < min(0.1, 0.25 / (beat * seconds / 4)), 1.0, 0.0) * np.where(

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.plugin import Array, Extension, Model, difference, site_units
-from gapcert_figures import Channel, Correlation, Course, DiagnosisFigure, Law, Signal, Waterfall, called
+from gapcert_figures import Channel, Correlation, Course, DiagnosisFigure, Law, Signal, Waterfall, called, per_second
 
 from .data.dataset import flat, once
 from .fitting.fit import Fit
@@ -120,7 +120,14 @@ def _courses(first: Fit, last: Fit) -> list[Course]:
 
 def _signals(design: Experiment, model: Model) -> tuple[Signal, ...]:
     units = {s.name: s.unit for s in model.inputs}
-    return tuple(Signal(n, units.get(n, "1"), design.t, v) for n, v in design.inputs.items())
+    out = [Signal(n, units.get(n, "1"), design.t, v) for n, v in design.inputs.items()]
+    for n, moved in design.travel.items():
+        y, step = design.predicted[n], design.t[1] - design.t[0]
+        rate = np.append(np.diff(y, axis=1), y[:, -1:] - y[:, -2:-1], axis=1) / step
+        fast = moved.recorded_speed * np.array([-1.0, 1.0])
+        out += [Signal(n, moved.unit, design.t, y, np.array(moved.recorded))]
+        out += [Signal(f"speed of {n}", per_second(moved.unit), design.t, rate, fast)]
+    return tuple(out)
 
 
 @final

@@ -161,12 +161,43 @@ class Unexplained:
 
 @final
 @dataclass(frozen=True)
+class Apart:
+    """How far apart an experiment drives two rivals: RMS in noise floors of what the other cannot copy, if `one` is true, and
+    if `other` is. separated: does that decide?
+    """
+
+    one: tuple[str, str]
+    other: tuple[str, str]
+    if_one: float
+    if_other: float
+    separated: bool
+
+
+@final
+@dataclass(frozen=True)
+class Travel:
+    """Of a measured output in an experiment, as any rival expects it: where it goes, and how fast at most, per s; beside what
+    it did in the recording.
+    """
+
+    low: float
+    high: float
+    unit: str
+    speed: float
+    recorded: tuple[float, float]
+    recorded_speed: float
+
+
+@final
+@dataclass(frozen=True)
 class Experiment:
     """An input that tells two rivals apart: computed from both fits, inside the limits.
 
     t (T,) in s, inputs: name → (T,); separation: rms distance, in units of the noise floor, between what one rival predicts
-    and the best that the other can do to copy it; others: separation of every other input that was tried, by its name;
-    travel: of every measured output (lowest, highest, unit), as either rival expects it.
+    and the best that the other can do to copy it, of the pair in `rivals`, which is the hardest; others: separation of every
+    other input that was tried, by its name; travel: of every measured output. apart: of every two that tie. start: the states
+    from which it begins and the inputs that are held there, (value, unit). predicted: of every measured output (rivals, T).
+    window: how long the stretches are, in s, whose starts the copy may choose.
     """
 
     rivals: tuple[tuple[str, str], tuple[str, str]]
@@ -176,15 +207,22 @@ class Experiment:
     inputs: Mapping[str, Array]
     separation: float
     others: Mapping[str, float] = field(default_factory=dict)
-    travel: Mapping[str, tuple[float, float, str]] = field(default_factory=dict)
+    travel: Mapping[str, Travel] = field(default_factory=dict)
+    apart: tuple[Apart, ...] = ()
+    start: Mapping[str, tuple[float, str]] = field(default_factory=dict)
+    predicted: Mapping[str, Array] = field(default_factory=dict)
+    window: float | None = None
 
     def summary(self) -> dict[str, Any]:
         """As plain data, without the signal."""
-        rivals = [{"effect": e, "site": s} for e, s in self.rivals]
+        rivals = [_of(r) for r in self.rivals]
         seconds = float(np.ptp(self.t)) if len(self.t) else 0.0
         told = {"name": self.name, "sentence": self.sentence, "seconds": seconds, "separation": self.separation}
-        travel = {n: {"low": low, "high": high, "unit": unit} for n, (low, high, unit) in self.travel.items()}
-        return {"rivals": rivals, **told, "travel": travel, "others": dict(self.others)}
+        told |= {} if self.window is None else {"window": self.window}
+        travel = {n: vars(t) | {"recorded": list(t.recorded)} for n, t in self.travel.items()}
+        apart = [vars(p) | {"one": _of(p.one), "other": _of(p.other)} for p in self.apart]
+        start = {n: {"value": v, "unit": unit} for n, (v, unit) in self.start.items()}
+        return {"rivals": rivals, **told, "start": start, "travel": travel, "apart": apart, "others": dict(self.others)}
 
     def csv(self) -> str:
         """As a file to play: column t in s, then every input in the model's unit, held from one row to the next."""
@@ -269,6 +307,10 @@ class Diagnosis(Shown):
         told: dict[str, Any] = {k: list(getattr(self, k)) for k in ("warnings", "assumptions")}
         told |= {k: dict(getattr(self, k)) for k in ("refitted", "log")}
         return out | {k: v for k, v in told.items() if v} | {"timings": dict(self.timings)}
+
+
+def _of(key: tuple[str, str]) -> dict[str, str]:
+    return {"effect": key[0], "site": key[1]}
 
 
 def _cause(cause: Cause) -> dict[str, Any]:

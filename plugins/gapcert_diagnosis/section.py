@@ -68,9 +68,11 @@ class ExperimentConfig(Section):
     """What an experiment may do that tells apart what these data do not: [low, high] of inputs and outputs, and how long."""
 
     limits: Boxes = Field(
-        default_factory=dict, description="input or measured output → [low, high]; default: inputs as in the recording"
+        default_factory=dict, description="input or measured output → [low, high]; default: as in the recording"
     )
-    seconds: Seconds = Field(12.0, description="how long it may take")
+    seconds: Seconds | None = Field(
+        None, description="how long it may take; default: 20 turns of the motion or 12 s, at most as long as the recording"
+    )
 
 
 def _points(value: Any) -> Any:

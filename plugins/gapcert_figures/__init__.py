@@ -13,7 +13,7 @@ _HOME = homes(
             "RecordedFigure Runs Slice Stretch WinningFigure drawn gap_figure held labelled loop_figure recorded_figure "
             "winning_figure"
         ),
-        "gapcert_figures.diagnosis": "KINDS Correlation Course Law Signal Waterfall called spoken",
+        "gapcert_figures.diagnosis": "KINDS Correlation Course Law Signal Waterfall called per_second spoken",
         "gapcert_figures.playback": "Motion Playback channel_playback loop_playback state_playback",
     }
 )

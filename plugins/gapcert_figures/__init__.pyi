@@ -28,6 +28,7 @@ from gapcert_figures.diagnosis import Law as Law
 from gapcert_figures.diagnosis import Signal as Signal
 from gapcert_figures.diagnosis import Waterfall as Waterfall
 from gapcert_figures.diagnosis import called as called
+from gapcert_figures.diagnosis import per_second as per_second
 from gapcert_figures.diagnosis import spoken as spoken
 from gapcert_figures.playback import Motion as Motion
 from gapcert_figures.playback import Playback as Playback

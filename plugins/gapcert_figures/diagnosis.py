@@ -31,6 +31,11 @@ def called(effect: str, site: str) -> str:
     return f"parameter {site}" if effect == "parameter" else f"{spoken(effect)} at {site}"
 
 
+def per_second(unit: str) -> str:
+    """`rad` → `rad/s`, `m/s` → `(m/s)/s`."""
+    return f"{unit}/s" if unit.isalnum() else f"({unit})/s"
+
+
 @final
 @dataclass(frozen=True)
 class Law:
@@ -91,12 +96,16 @@ class Course:
 @final
 @dataclass(frozen=True)
 class Signal:
-    """One input of the proposed experiment."""
+    """Of the proposed experiment an input (T,), or a measured output or its speed as each rival foretells it (rivals, T).
+
+    recorded: [low, high] of it in the recording, for what is foretold.
+    """
 
     name: str
     unit: str
     t: Array
     values: Array
+    recorded: Array = field(default_factory=lambda: np.empty(0))
 
 
 @final

@@ -31,8 +31,9 @@ def draw_diagnosis(canvas: Canvas, d: DiagnosisFigure) -> None:
         title = f"Errors of trajectory {i + 1}" if len(d.courses) > 1 else "Error of each window"
         _course(canvas, f"left/course{i}", course, title)
     for s in d.experiment:
-        root, reach = f"experiment/{s.name}", 1.1 * float(np.abs(s.values).max() or 1.0)
-        canvas.line(f"{root}/signal", s.t, s.values, TRUTH, s.name, 1.0)
+        root, reach = f"experiment/{s.name.replace(' ', '-')}", 1.1 * float(np.abs(s.values).max() or 1.0)
+        for k, row in enumerate(np.atleast_2d(s.values)):
+            canvas.line(f"{root}/signal{k or ''}", s.t, row, TRUTH, s.name, 1.0)
         canvas.show("experiment", s.name, series(root, f"The experiment: {s.name} [{s.unit}]", -reach, reach, float(s.t[-1])))
     if d.playback is not None:
         draw_robot(canvas, d.playback)

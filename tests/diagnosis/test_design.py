@@ -1,6 +1,9 @@
 """Experiments that tell rivals apart: designed from the fits alone, played on a system that shares no code with them."""
 
+import itertools
 import math
+import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,7 +22,7 @@ NOISE = 2e-3
 LOOSE = {**ROD, "parameters": {**ROD["parameters"], "m": {"value": "1 kg", "tolerance": "2 %"}}}
 
 
-def swing(u, law, seed, x0=(0.0, 0.05)):
+def swing(u, law, seed, x0=(0.0, 0.05), noise=NOISE):
     """A rod of 1.01 kg under a law the hard way: fine explicit steps, and sticking by clamping the velocity."""
     h, m = PERIOD / FINE, 1.01
     q, v = x0
@@ -42,7 +45,7 @@ def swing(u, law, seed, x0=(0.0, 0.05)):
         free = v + 3 * h / m * force
         v = math.copysign(max(abs(free) - dry, 0.0), free)
         q += h * v
-    noise = NOISE * np.random.default_rng(seed).standard_normal(len(path))
+    noise = noise * np.random.default_rng(seed).standard_normal(len(path))
     return gc.Recording.of(np.arange(len(u)) * PERIOD, {"q": path + noise, "u": np.asarray(u, dtype=float)})
 
 
@@ -93,7 +96,7 @@ def test_the_experiment_tells_rivals_apart_that_the_data_do_not(name):
     log = swing(u, truth, 1)
     model, measured, (right, wrong) = rivals(log, keys)
     limits = Limits.of(model, measured, {"u": [-2, 2], "q": ["-1.5 rad", "1.5 rad"]})
-    found, separable = design([Rivalry(*keys, right, wrong)], measured, limits, 120)
+    found, separable, _ = design([Rivalry(*keys, right, wrong)], measured, limits, 120)
     assert separable == (True,)
     again, same = (rivals(together(log, swing(v, truth, 2)), keys)[2] for v in (found.inputs["u"], u))
     assert better(*again) > max(100, 3 * better(*same))
@@ -111,9 +114,9 @@ def test_what_no_input_separates_has_no_experiment():
     _, measured, fits = rivals(swing(np.sin(2 * np.pi * 0.35 * T), {"constant": 0.08}, 1), SAME)
     model = fits[0].hypothesis.model
     found = design([Rivalry(*SAME, *fits)], measured, Limits.of(model, measured, {"u": [-3, 3]}), 120)
-    assert found == (None, (False,))
+    assert found == (None, (False,), {})
     nothing_to_play = Limits({}, {"q": (-1.0, 1.0)}, 12.0)
-    assert design([Rivalry(*SAME, *fits)], measured, nothing_to_play, 120) == (None, (False,))
+    assert design([Rivalry(*SAME, *fits)], measured, nothing_to_play, 120) == (None, (False,), {})
 
 
 def test_late_inputs_and_a_late_sensor_are_one_to_every_input():
@@ -122,7 +125,10 @@ def test_late_inputs_and_a_late_sensor_are_one_to_every_input():
     keys = [("input-delay", "u"), ("sensor-delay", "q")]
     model, measured, fits = rivals(log, keys)
     assert abs(better(*fits)) < 10
-    assert design([Rivalry(*keys, *fits)], measured, Limits.of(model, measured, {"u": [-1, 1]}, 4.0), 120) == (None, (False,))
+    found, separable, besides = design([Rivalry(*keys, *fits)], measured, Limits.of(model, measured, {"u": [-1, 1]}, 4.0), 120)
+    assert (found, separable) == (None, (False,))
+    # A second sensor, which is not late, shows which it is.
+    assert besides == {0: "measure q_dot as well, with noise of 1 % of its deviation or less"}
 
 
 def test_an_experiment_stays_where_the_recording_was_and_says_how_far_it_goes():
@@ -130,12 +136,16 @@ def test_an_experiment_stays_where_the_recording_was_and_says_how_far_it_goes():
     log = swing(u, truth, 1)
     model, measured, fits = rivals(log, keys)
     recorded = log.trajectories[0].channels["q"]
-    found, separable = design([Rivalry(*keys, *fits)], measured, Limits.of(model, measured, seconds=6.0), 120)
+    found, separable, _ = design([Rivalry(*keys, *fits)], measured, Limits.of(model, measured, seconds=6.0), 120)
     assert separable == (True,)
     went = swing(found.inputs["u"], truth, 3).trajectories[0].channels["q"]
-    low, high, unit = found.travel["q"]
-    room = 0.05 * np.ptp(recorded)
-    assert unit == "rad"
+    told = found.travel["q"]
+    low, high, room = told.low, told.high, 0.05 * np.ptp(recorded)
+    assert told.unit == "rad"
+    assert np.allclose(told.recorded, (recorded.min(), recorded.max()), atol=room)
+    speed = np.abs(np.diff(went)).max() / PERIOD
+    assert told.speed <= told.recorded_speed
+    assert abs(speed - told.speed) < 2.5 * NOISE / PERIOD * math.sqrt(2)
     assert recorded.min() - room < went.min()
     assert went.max() < recorded.max() + room
     assert np.allclose((low, high), (went.min(), went.max()), atol=room)
@@ -146,23 +156,63 @@ def test_the_pair_that_is_hardest_to_separate_decides_and_the_rest_is_said():
     log = swing(u, truth, 1)
     model, measured, fits = rivals(log, [*keys, ("input-offset", "u")])
     pairs = [Rivalry(keys[1], ("input-offset", "u"), fits[1], fits[2]), Rivalry(*keys, *fits[:2])]
-    found, separable = design(pairs, measured, Limits.of(model, measured, {"q": [-3, 3]}, 6.0), 120)
+    found, separable, _ = design(pairs, measured, Limits.of(model, measured, {"q": [-3, 3]}, 6.0), 120)
     assert separable == (False, True)
     assert found.rivals == tuple(keys)
     assert len(found.t) == 600
 
 
-def test_one_input_serves_all_pairs():
+def test_one_input_serves_all_pairs_and_what_is_promised_of_each_is_found_when_it_is_played():
     truth, _, u = CASES["quadratic and viscous"]
     keys = [(name, "q") for name in ("quadratic-drag", "viscous-friction", "coulomb-friction")]
     log = swing(0.5 * u, truth, 1)
-    model, measured, (right, *wrong) = rivals(log, keys)
-    pairs = [Rivalry(keys[0], key, right, other) for key, other in zip(keys[1:], wrong, strict=True)]
-    limits = Limits.of(model, measured, {"u": [-2, 2], "q": ["-1.5 rad", "1.5 rad"]})
-    found, separable = design(pairs, measured, limits, 120)
-    assert separable == (True, True)
-    best, *others = rivals(together(log, swing(found.inputs["u"], truth, 2)), keys)[2]
+    model, measured, fits = rivals(log, keys)
+    known = list(zip(keys, fits, strict=True))
+    pairs = [Rivalry(a, b, f, g) for (a, f), (b, g) in itertools.combinations(known, 2)]
+    found, separable, besides = design(pairs, measured, Limits.of(model, measured, {"u": [-2, 2], "q": [-1.5, 1.5]}), 120)
+    assert (separable, besides) == ((True, True, True), {})
+    assert [(p.one, p.other) for p in found.apart] == [(p.named, p.other) for p in pairs]
+    start = [found.start[n][0] for n in ("q", "q_dot")]
+    best, *others = rivals(together(log, swing(found.inputs["u"], truth, 2, start)), keys)[2]
     assert all(better(best, other) > 100 for other in others)
+    both = Dataset.of(model, together(log, swing(found.inputs["u"], truth, 2, start, noise=0.0)))
+    windows = replace(both, sigma=measured.sigma).windows(round(found.window / PERIOD))
+    second = windows.place[:, 0] == 1
+    for p, (_, rival) in zip(found.apart, known[1:], strict=False):
+        left = fit(rival.hypothesis, windows, theta=rival.theta).residual[second]
+        assert np.sqrt(np.mean(left**2)) == pytest.approx(p.if_one, rel=0.2)
+
+
+def test_an_experiment_begins_and_ends_at_rest_where_the_recording_was():
+    """It went one way only: at the end of its range there is no room, so it begins farther in, under an input that is held."""
+    truth, keys, u = CASES["Coulomb and constant"]
+    model, measured, fits = rivals(swing(u, truth, 1), keys)
+    found, separable, _ = design([Rivalry(*keys, *fits)], measured, Limits.of(model, measured), 120)
+    assert separable == (True,)
+    (q, _), (speed, _), (held, unit) = (found.start[n] for n in ("q", "q_dot", "u"))
+    assert (speed, unit) == (0.0, "N*m")
+    assert abs(held - 1.01 * 9.81 / 2 * math.sin(q)) < 0.1
+    low, high = found.travel["q"].recorded
+    assert low + 0.05 * (high - low) < q < high - 0.05 * (high - low)
+    assert found.inputs["u"][-1] == pytest.approx(held)
+    went = (
+        swing(np.concatenate([np.full(5, held), found.inputs["u"]]), truth, 3, (q, 0.0), noise=0.0)
+        .trajectories[0]
+        .channels["q"]
+    )
+    assert low - 0.01 * (high - low) < went.min() < went.max() < high + 0.01 * (high - low)
+    assert np.abs(np.diff(went)).max() / PERIOD < 1.05 * found.travel["q"].recorded_speed
+
+
+def test_what_only_wider_limits_tell_apart_is_said_with_where_they_lead():
+    truth, keys, u = CASES["Coulomb and constant"]
+    model, measured, fits = rivals(swing(u, truth, 1), keys)
+    narrow = Limits.of(model, measured, {"u": [0.0, 0.02]})
+    found, separable, besides = design([Rivalry(*keys, *fits)], measured, narrow, 120)
+    assert (found, separable) == (None, (False,))
+    assert re.match(
+        r"where the machine may, let u go from .* N\*m and q from .* rad \(diagnose.experiment.limits\)", besides[0]
+    )
 
 
 def test_what_drifts_comes_back():

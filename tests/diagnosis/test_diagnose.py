@@ -195,7 +195,8 @@ def test_ambiguous_when_the_speed_never_changes_until_the_experiment_is_played()
     assert found.experiment.startswith(f"to tell {found.causes[0].effect} at q from ")
     assert found.summary()["ambiguous_with"][0][0].keys() == {"effect", "site"}
     assert found.design.rivals[0] == ("viscous-friction", "q")
-    played = hide(cart, drag, x0=[0.0, 1.0], u=found.design.inputs["u"][:, None], noise={"q": 1e-3}, seed=2)
+    x0 = [found.design.start[n][0] for n in ("q", "q_dot")]
+    played = hide(cart, drag, x0=x0, u=found.design.inputs["u"][:, None], noise={"q": 1e-3}, seed=2)
     assert np.abs(found.design.inputs["u"]).max() <= 1
     both = find(cart, gc.Recording((*log.trajectories, *played.trajectories)), FRICTIONS)
     assert (both.verdict, both.causes[0].effect, both.ambiguous_with) == ("causes", "viscous-friction", ())
@@ -212,7 +213,8 @@ def test_a_late_force_and_a_late_sensor_have_no_experiment_and_what_would_tell_i
     assert (found.verdict, found.design) == ("causes", None)
     assert found.ambiguous_with == ((("sensor-delay", "q"),),)
     assert found.sentence().endswith(
-        "To tell input-delay at u from sensor-delay at q: measure u where it acts, or q with a second sensor."
+        "To tell input-delay at u from sensor-delay at q: measure u where it acts, or q with a second sensor; "
+        "or measure q_dot as well, with noise of 1 % of its deviation or less."
     )
 
 

@@ -283,7 +283,7 @@ def test_equal_explanations_are_named_by_the_simplest_and_no_experiment_is_promi
     library = answer.search.library
     limits = Limits.of(library.model, library.measured)
     ties = [t for t in answer.ties if keys(t[0]) == {("input-offset", "u")}]
-    design, apart = told_apart(answer.causes, answer.fit, ties, library.measured, limits)
+    design, apart, _ = told_apart(answer.causes, answer.fit, ties, library.measured, limits)
     assert design is None
     assert apart == (False,)
 

@@ -104,13 +104,19 @@ def test_other_answers():
     bought = " With the simplest the 0.4 s error falls from 0.153 to 0.038 rad."
     assert sentence(either) == said + "To tell them apart: play fast inputs." + bought
     design = {"name": "fast multisine", "seconds": 12.0, "separation": 0.34, "others": {}, "sentence": "", "rivals": []}
-    played = (
-        "To decide, play fast multisine for 12 s: what one predicts then stays 0.34 noise floors from the best copy by the "
+    far = "play fast multisine for 12 s: whatever its numbers, the false one then misses the log by 0.34 noise floors (RMS)."
+    assert sentence(either | {"design": design}) == f"{said}To decide, {far}{bought}"
+    moved = {"low": -0.5, "high": 1.25, "unit": "rad", "speed": 3.0, "recorded": [-1.0, 2.0], "recorded_speed": 4.0}
+    leads = " It should keep q between -0.5 and 1.25 rad (recorded: -1 to 2), at up to 3 rad/s (recorded: 4)."
+    begun = {"q": {"value": 0.1, "unit": "rad"}, "u": {"value": 0.0, "unit": "N*m"}}
+    whole = design | {"start": begun, "travel": {"q": moved}}
+    assert (
+        sentence(either | {"design": whole}) == f"{said}To decide, begin at q = 0.1 rad and u = 0 N·m, and {far}{leads}{bought}"
     )
-    assert sentence(either | {"design": design}) == said + played + "other." + bought
-    travel = {"q": {"low": -0.5, "high": 1.25, "unit": "rad"}, "w": {"low": 0.0, "high": 2.0, "unit": "1"}}
-    leads = "other. It should keep q between -0.5 and 1.25 rad and w between 0 and 2."
-    assert sentence(either | {"design": design | {"travel": travel}}) == said + played + leads + bought
+    pair = {"one": COULOMB, "other": tie[0][0], "if_one": 0.01, "if_other": 0.01, "separated": False}
+    beyond = " Beyond that, to tell them apart: play fast inputs."
+    assert sentence(either | {"design": whole | {"apart": [pair]}}).endswith(f"{leads}{beyond}{bought}")
+    assert beyond not in sentence(either | {"design": whole | {"apart": [pair | {"separated": True}]}})
     beside = FOUND["causes"] + [{**COULOMB, "effect": "cogging"}]
     both = either | {"causes": beside, "ambiguous_with": [[COULOMB, *tie[0]]]}
     assert (
@@ -121,9 +127,7 @@ def test_other_answers():
     assert alike.startswith("The simulation lacks Coulomb friction")
     assert alike.endswith("No input within the limits separates this from input lag at u.")
     limited = sentence(FOUND | {"ambiguous_with": tie, "seconds": 12.0})
-    said = (
-        "No input of 12 s within the limits separates this from input lag at u; a longer one may (diagnose.experiment.seconds)."
-    )
+    said = "No input of 12 s within the limits separates this from input lag at u."
     assert limited.endswith(said)
     besides = {"experiment": "to tell them apart: measure u where it acts"}
     assert sentence(FOUND | besides | {"ambiguous_with": tie, "seconds": 12.0}).endswith(

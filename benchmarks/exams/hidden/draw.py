@@ -221,20 +221,21 @@ def sized(made: Rig, noise: log.Noise, key: tuple[str, str], drawn: Shape, targe
     return size, found
 
 
-def doubtful(part: str, seed: int, index: int, systems: Sequence[str] = ROBOTS) -> Case:
+def doubtful(part: str, seed: int, index: int, systems: Sequence[str] = ("pendulum", "drive", "cartpole")) -> Case:
     """One effect in a noisy log of one sine, where several effects may look alike."""
     rng = generator(part, seed, index)
     names = [e for e in NAMES if e != "sensor-quantisation" and any(sites(PLANTS[p], e) for p in systems)]
-    effect = names[index % len(names)]
-    case = None
+    effect, case = names[index % len(names)], None
     for _ in range(20):
         plant = PLANTS[str(rng.choice([p for p in systems if sites(PLANTS[p], effect)]))]
-        seconds, strength = float(rng.uniform(10, 13)), float(rng.uniform(0.1, 0.5))
-        made = rig(plant.name, "sine", 0.01, seconds, rng, strength)
-        quiet = noise(made, float(rng.uniform(0.02, 0.03)), False)
-        seen = [s for s in sites(plant, effect) if KIND[effect] != "output" or s in quiet.sigma]
-        case = _strong(part, seed, index, made, quiet, (effect, str(rng.choice(seen))), True, rng)
-        if case.strength >= 3:
+        made = rig(plant.name, "sine", 0.01, float(rng.uniform(7, 11)), rng, float(rng.uniform(0.1, 0.5)))
+        quiet = noise(made, float(rng.uniform(0.01, 0.03)), False)
+        site = str(rng.choice([s for s in sites(plant, effect) if KIND[effect] != "output" or s in quiet.sigma]))
+        drawn = shape(effect, made.scales(made.play((), COARSE), KIND[effect], site), rng)
+        target = math.exp(rng.uniform(math.log(3), math.log(10)))
+        size, strength = sized(made, quiet, (effect, site), drawn, target)
+        case = Case(part, seed, index, made, (Hidden(effect, site, drawn.at(size)),), quiet, "faint", strength)
+        if strength >= 3:
             break
     assert case is not None
     return case

@@ -62,7 +62,7 @@ class Dataset:
         log, at = Log(), {c.name: i for i, c in enumerate(channels)}
         if abs(recording.period - period) > THRESHOLDS.uneven_period * period:
             log.resampled = {"from": recording.period, "to": period}
-        named = {model.states[i].name: model.states[j].name for i, j in _driven(model)}
+        named = {model.states[i].name: model.states[j].name for i, j in driven(model)}
         rates = {at[a]: at[b] for a, b in named.items() if a in at and b in at}
         found = [
             (i, piece)
@@ -372,7 +372,7 @@ def _states(model: Model, channels: tuple[StateSpec, ...], piece: Piece) -> Arra
     for j, state in enumerate(model.states):
         if state.name in at:
             x[:, j] = piece.smooth[:, at[state.name]]
-    for i, j in _driven(model):
+    for i, j in driven(model):
         place, speed = (model.states[k].name for k in (i, j))
         if place in at and speed not in at:
             x[:, j] = piece.slope[:, at[place]]
@@ -420,7 +420,7 @@ def scatter(rows: Sequence[Array]) -> float:
     return min(found) / 0.6745
 
 
-def _driven(model: Model) -> list[tuple[int, int]]:
+def driven(model: Model) -> list[tuple[int, int]]:
     """(i, j): xⱼ is the velocity of xᵢ, ∂xᵢ⁺/∂xⱼ ≈ period."""
     jacobian = model.jacobian(np.zeros((1, model.nx)), np.zeros((1, model.nu)))[0] / model.period
     found = np.abs(jacobian[:, : model.nx] - 1) < 0.05

@@ -163,6 +163,13 @@ def _experiment(summary: Summary, album: DiagnosisAlbum, folder: Path) -> Html |
     if not (design := summary.get("design")):
         return said(summary.get("experiment") and f"An experiment that would tell more: {summary['experiment']}")
     pair = [cause_name(r) for r in design["rivals"]]
+    pairs = [
+        (cause_name(p["one"]), cause_name(p["other"]), number(p["if_one"], 2), number(p["if_other"], 2))
+        for p in design.get("apart", ())
+    ]
+    head = ("one", "other", "if one is true", "if other is")
+    caption = "What this input tells apart: how far the best copy by the false one misses, in noise floors (RMS)"
+    tried = "How far one rival's prediction stays from the best copy by the other, in noise floors (RMS)"
     rows = [(design["name"], number(design["separation"], 3))]
     rows += [(n, number(v, 3)) for n, v in sorted(design["others"].items(), key=lambda x: -x[1])]
     file = Path(summary["experiment_file"]).name if summary.get("experiment_file") else None
@@ -172,8 +179,8 @@ def _experiment(summary: Summary, album: DiagnosisAlbum, folder: Path) -> Html |
         h("p", "The signal is in ", h("code", file), " in the folder of this run. Record the answer, add the log to ",
           h("code", "recording.files"), " and diagnose both together.") if file else None,
         gallery(album.experiment),
-        table("How far one rival's prediction stays from the best copy by the other, in noise floors (RMS)",
-              ("input", "apart"), rows),
+        table(caption, head, pairs, 2) if pairs else None,
+        folded(f"What each of {len(rows)} inputs tells apart", table(tried, ("input", "apart"), rows)),
     )  # fmt: skip
 
 

@@ -174,15 +174,21 @@ def course_picture(i: int, c: Course, many: bool) -> Picture:
 
 
 def signal_picture(i: int, s: Signal) -> Picture:
-    """An input of the proposed experiment."""
-    unit, label = scaled(s.unit, s.values)
+    """An input of the proposed experiment, or what is expected of an output."""
+    unit, label = scaled(s.unit, s.values, s.recorded)
+    rows = np.atleast_2d(s.values)
 
     def on(ax: Axes) -> None:
         step = max(1, len(s.t) // (3 * POINTS))
-        ax.plot(s.t[::step], s.values[::step] / unit, color=INK, lw=1)
+        for row, colour in zip(rows, (INK, *[WITH, WITHOUT, TRUTH] * len(rows)), strict=False):
+            ax.plot(s.t[::step], row[::step] / unit, color=colour, lw=1)
+        for level in s.recorded:
+            ax.axhline(level / unit, color=BAD, lw=0.8, ls=":")
         ax.set(xlabel="time [s]", ylabel=f"{s.name} [{pretty(label)}]")
 
     caption = f"{s.name}, to be played to the real system and recorded."
+    if len(s.recorded):
+        caption = f"{s.name}, as each of the causes that tie foretells it; dotted: how far it went in the recording."
     return draw(f"signal{i}", f"The experiment: {s.name}", caption, on, 2.2, link="experiment")
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from gapcert.plugin import pretty, share
-from gapcert_figures import KINDS, called, spoken
+from gapcert_figures import KINDS, called, per_second, spoken
 
 from .words import Summary, listed, markdown_table, number, refutation
 
@@ -136,12 +136,10 @@ def _causes(summary: Summary) -> str:
 
 
 def _alike(same: Sequence[str], seconds: float | None, told: str | None) -> str:
-    """What no experiment tells apart from the answer, the limit that a longer one needs, and what to measure besides."""
+    """What no experiment of so many seconds tells apart from the answer, and what to measure besides."""
     rivals, besides = ", or from ".join(same), f" {told[:1].upper()}{told[1:]}." if told else ""
-    if seconds is None:
-        return f"No input within the limits separates this from {rivals}.{besides}"
-    longer = "a longer one may (diagnose.experiment.seconds)"
-    return f"No input of {seconds:.3g} s within the limits separates this from {rivals}; {longer}.{besides}"
+    long = "" if seconds is None else f" of {seconds:.3g} s"
+    return f"No input{long} within the limits separates this from {rivals}.{besides}"
 
 
 def _means(setting: str) -> str:
@@ -246,22 +244,26 @@ def _ambiguous(summary: Summary) -> str:
     text = f"{beside} recording cannot tell whether it is {', or '.join(n for n in names if n)}."
     if design := summary.get("design"):
         text += f" {experiment_sentence(design)}"
-    elif told := summary.get("experiment", ""):
-        text += f" {told[:1].upper()}{told[1:]}."
+    if (told := summary.get("experiment", "")) and not (design and all(p["separated"] for p in design.get("apart", ()))):
+        text += f"{' Beyond that, t' if design else ' T'}{told[1:]}."
     gain = gain_phrase(summary).replace("with it", "With the simplest", 1).replace("with them", "With the simplest", 1)
     return f"{text} {gain}." if gain else text
 
 
 def experiment_sentence(design: Summary) -> str:
-    """What to play, where that leads, and how far the rivals then are apart."""
+    """From where to play what, where that leads and how fast, and how far the rivals then are apart."""
     size = number(float(f"{design['separation']:.2g}"))
-    apart = f"what one predicts then stays {size} noise floors from the best copy by the other"
+    apart = f"whatever its numbers, the false one then misses the log by {size} noise floors (RMS)"
+    start = [f"{n} = {measured(number(v['value'], 3), v['unit'])}" for n, v in design.get("start", {}).items()]
+    begin = f"begin at {listed(start)}, and play" if start else "play"
     ways = [
-        f"{name} between {number(y['low'], 3)} and {measured(number(y['high'], 3), y['unit'])}"
+        f"{name} between {number(y['low'], 3)} and {measured(number(y['high'], 3), y['unit'])} "
+        f"(recorded: {number(y['recorded'][0], 3)} to {number(y['recorded'][1], 3)}), "
+        f"at up to {measured(number(y['speed'], 3), per_second(y['unit']))} (recorded: {number(y['recorded_speed'], 3)})"
         for name, y in design.get("travel", {}).items()
     ]
     leads = f" It should keep {listed(ways)}." if ways else ""
-    return f"To decide, play {design['name']} for {number(design['seconds'], 3)} s: {apart}.{leads}"
+    return f"To decide, {begin} {design['name']} for {number(design['seconds'], 3)} s: {apart}.{leads}"
 
 
 def _unexplained(summary: Summary) -> str:
