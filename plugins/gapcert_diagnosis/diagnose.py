@@ -218,7 +218,8 @@ class Spared:
 
 def _searched(problem: DiagnosisProblem) -> Diagnosis:
     """With equations: effects are added to them, and what does not pay is dropped."""
-    data, lap, seed, spared = Data.of(problem), problem.clock.lap, problem.seed, Spared()
+    data, lap, seed, spared, asked = Data.of(problem), problem.clock.lap, problem.seed, Spared(), problem.experiment
+    limits = Limits.of(data.library.model, data.library.measured, asked.get("limits"), asked.get("seconds", 12.0))
     lap("evidence")
 
     settled, windows = _settled(data, problem)
@@ -246,8 +247,7 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
 
     gain = {f"{j.horizon:g}": j.gains(answer.nothing, answer.fit, seed) for j in judges}
     lap("gain")
-    dataset, asked = answer.dataset, problem.experiment
-    limits = Limits.of(data.library.model, dataset, asked.get("limits"), asked.get("seconds", 12.0))
+    dataset = answer.dataset
     design, _ = spared("experiment", (None, ()), told_apart, answer.causes, answer.fit, answer.ties, dataset, limits, seed)
     lap("experiment")
     left = leftover.left(data.library.extended(answer.causes, answer.fit.values), answer.fit, seed)
