@@ -29,7 +29,7 @@ from .fitting.step_size import coarse, settled
 from .residual import unexplained as leftover
 from .residual.adequacy import blind, close
 from .residual.pushes import elsewhere, pushes
-from .results import Cause, Diagnosis, Estimate, Misfit, Push, Rival
+from .results import Cause, Diagnosis, Estimate, Misfit, Push, Rival, Verdict
 from .search.alternatives import Answer, answered, decided, flags, unit_slip
 from .search.candidates import Candidate, Library
 from .search.criterion import noise, without
@@ -218,7 +218,8 @@ class Spared:
 
 def _searched(problem: DiagnosisProblem) -> Diagnosis:
     """With equations: effects are added to them, and what does not pay is dropped."""
-    data, lap, seed, spared = Data.of(problem), problem.clock.lap, problem.seed, Spared()
+    data, lap, seed, spared, asked = Data.of(problem), problem.clock.lap, problem.seed, Spared(), problem.experiment
+    limits = Limits.of(data.library.model, data.library.measured, asked.get("limits"), asked.get("seconds"))
     lap("evidence")
 
     settled, windows = _settled(data, problem)
@@ -246,12 +247,12 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
 
     gain = {f"{j.horizon:g}": j.gains(answer.nothing, answer.fit, seed) for j in judges}
     lap("gain")
-    dataset, asked = answer.dataset, problem.experiment
-    limits = Limits.of(data.library.model, dataset, asked.get("limits"), asked.get("seconds"))
+    dataset = answer.dataset
     told = answer.causes, answer.fit, answer.ties, dataset, limits, seed
     design, separable, besides = spared("experiment", (None, (), {}), told_apart, *told)
     lap("experiment")
-    left = leftover.left(data.library.extended(answer.causes, answer.fit.values), answer.fit, seed)
+    whole_model = data.library.extended(answer.causes, answer.fit.values)
+    left = spared("test of what is left", None, leftover.left, whole_model, answer.fit, seed)
     doubted = doubt(answer.fit)
     undecided = design is not None or bool(answer.ties and spared.told)
     odd = bool(doubted and not named) or any(f.startswith("implausible") for c in named for f in c.flags)
@@ -260,19 +261,23 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
         return close(judge, answer.fit, seed, share)
 
     laws = len(answer.causes) + len(settings) + len(answer.library.seen)
-    verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, undecided, odd, near)
+    verdict: Verdict = "unexplained"
+    if left is not None:
+        verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, undecided, odd, near)
+        named = tuple(replace(c, flags=(*c.flags, *leftover.doubts(laws, left))) for c in named)
     if pushed and verdict == "nothing":
         verdict = "unexplained"
     lap("leftover")
     ties = [tuple(c.told for c in tie) for tie, _ in answer.ties]
     ties += [(("engine-setting", s.runner_up.setting),) for s in settings if s.runner_up and s.margin < THRESHOLDS.tie_score]
-    rest = spared("kind of what is missing", None, leftover.unexplained, left, pushed) if verdict == "unexplained" else None
+    missing = verdict == "unexplained" and left is not None
+    rest = spared("kind of what is missing", None, leftover.unexplained, left, pushed) if missing else None
     correction = None if rest is None else rest.correction
     changed = f"setting {' and '.join(s.variant.setting for s in settings)}"
     first = (changed, answer.plain) if settings and answer.plain is not None else None
     return Diagnosis(
         verdict,
-        tuple(replace(c, flags=(*c.flags, *leftover.doubts(laws, left))) for c in named),
+        named,
         _misfits(answer),
         gain,
         _extended(answer, pushed if calm and len(problem.recording.trajectories) == 1 else ()),
@@ -281,9 +286,9 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
         rest,
         spared("pictures", None, figure, answer.search, answer.causes, answer.fit, judge, design, correction, first),
         design=design,
-        evidence=spared("tests of the residual", {}, leftover.evidence, left),
+        evidence={} if left is None else spared("tests of the residual", {}, leftover.evidence, left),
         negligible=_negligible(answer),
-        smallest=smallest(answer.search) if verdict == "nothing" else (),
+        smallest=spared("smallest sizes", (), smallest, answer.search) if verdict == "nothing" else (),
         log={**dataset.log, "hold": dataset.hold or "undeclared"},
         assumptions=(*data.assumptions, *doubted, *_chosen(answer)),
         # How long the experiments were, of which none tells the ties apart.

@@ -64,9 +64,11 @@ def test_a_defect_after_the_answer_leaves_it_standing(whole, monkeypatch, name, 
     assert found.summary()["warnings"] == [told]
 
 
-def test_what_was_asked_wrongly_is_still_refused():
+@pytest.mark.parametrize("limits", [{"nobody": [0, 1]}, {"u": [1, 1]}])
+def test_what_was_asked_wrongly_is_refused_before_the_search(monkeypatch, limits):
+    monkeypatch.setattr(sys.modules["gapcert_diagnosis.diagnose"], "_settled", None)
     with pytest.raises(gc.UsageError, match="experiment"):
-        gc.diagnose(*late(), effects=["input-delay"], horizons=[1.0], experiment={"limits": {"nobody": [0, 1]}})
+        gc.diagnose(*late(), effects=["input-delay"], horizons=[1.0], experiment={"limits": limits})
 
 
 def test_pushes_that_cannot_be_looked_for_are_told_so(whole, monkeypatch):
@@ -77,3 +79,16 @@ def test_pushes_that_cannot_be_looked_for_are_told_so(whole, monkeypatch):
     found = diagnosed()
     assert found.warnings == ("pushes could not be looked for (recording: 3 windows are too few); the answer stands",)
     assert [c.effect for c in found.causes] == [c.effect for c in whole.causes]
+
+
+def test_what_cannot_be_tested_is_not_called_explained(whole, monkeypatch):
+    def broken(*given):
+        raise np.linalg.LinAlgError("no such thing")
+
+    monkeypatch.setattr(sys.modules["gapcert_diagnosis.diagnose"].leftover, "left", broken)
+    found = diagnosed()
+    assert found.verdict == "unexplained"
+    assert [(c.effect, c.site) for c in found.causes] == [(c.effect, c.site) for c in whole.causes]
+    assert found.warnings[0].startswith("the test of what is left could not be made (LinAlgError: no such thing)")
+    assert found.sentence()
+    assert all(c["partial"] for c in found.summary()["causes"])

@@ -1,9 +1,12 @@
 """What is wrong with a recording is told at the key of the spec that asks for it."""
 
+import os
+
 import pytest
 
 import gapcert as gc
 from gapcert.cli.main import main
+from gapcert.spec.compose import data_files
 
 SPEC = """version: 1
 name: slide
@@ -120,3 +123,18 @@ def test_a_value_that_is_no_number_is_told_at_the_channel(tmp_path, monkeypatch,
     assert main(["inspect", "slide.yaml"]) == 2
     says = "slide.yaml:13:26: error: recording.columns.F: log.csv: column 'force' holds 'off' in line 7; expected a number"
     assert says in capsys.readouterr().err
+
+
+def test_a_folder_that_goes_while_it_is_read_is_left_out(tmp_path, monkeypatch):
+    for name in ("kept", "gone"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "log.csv").write_text(ROWS)
+    listed = os.scandir
+
+    def vanishing(path):
+        if str(path).endswith("gone"):
+            raise FileNotFoundError(path)
+        return listed(path)
+
+    monkeypatch.setattr(os, "scandir", vanishing)
+    assert data_files(tmp_path) == [tmp_path / "kept" / "log.csv"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import itertools
 import math
+import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
@@ -49,11 +50,10 @@ def matching(path: Path) -> list[Path]:
 
 
 def data_files(path: Path) -> list[Path]:
-    """A file, those that a pattern stands for, or those of a folder (a bag, a data set; not its videos), and of these never
-    more than one over what a folder may have.
-    """
+    """A file, those of a pattern, or those of a folder (a bag, a data set; not its videos): of these at most one too many."""
     if path.is_dir():
-        found = (p for p in path.rglob("*") if p.suffix not in (".mp4", ".png") and regular(p))
+        every = (Path(at, name) for at, _, names in os.walk(path) for name in names)  # without folders that cannot be read
+        found = (p for p in every if p.suffix not in (".mp4", ".png") and regular(p))
         return sorted(itertools.islice(found, THRESHOLDS.folder_files + 1))
     return [path] if path.is_file() else matching(path) if "*" in path.name else []
 
