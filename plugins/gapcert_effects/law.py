@@ -58,11 +58,15 @@ def spread(low: float, high: float, count: int) -> tuple[float, ...]:
     return tuple(float(v) for v in np.geomspace(low, high, count))
 
 
+def graded(low: float, high: float) -> tuple[float, ...]:
+    """Numbers from low to high, each at most `next_time` times the one before."""
+    return spread(low, high, 1 + math.ceil(math.log(high / low) / math.log(THRESHOLDS.next_time)))
+
+
 def times(parameter: EffectParameter, scales: Mapping[str, float], share: float = 0.9) -> tuple[float, ...]:
     """From half a period of sampling to this share of the longest time that a parameter may take."""
     high = share * parameter.bounds(scales)[1]
-    low = min(0.5 * scales["period"], 0.5 * high)
-    return spread(low, high, 1 + math.ceil(math.log(high / low) / math.log(THRESHOLDS.next_time)))
+    return graded(min(0.5 * scales["period"], 0.5 * high), high)
 
 
 def driven(site: str, model: gc.Model) -> bool:
@@ -94,8 +98,17 @@ def straight(site: str, model: gc.Model) -> bool:
 
 
 def moves(site: str, model: gc.Model) -> bool:
-    """Does something move there, by its unit: is it a length, an angle or a pure number, or how fast one changes?"""
-    return straight(site, model) or {s.name: s.unit for s in model.states}[site].removesuffix("/s") in (*_TURNS, "1")
+    """Does something move there, by its unit: is the coordinate a length, an angle or a pure number, or the state a speed?
+
+    Levels, temperatures, pressures and charges are no speeds.
+    """
+    unit, places = {s.name: s.unit for s in model.states}[site], (*_LENGTHS, *_TURNS, "1")
+    return unit in (places if _mechanical(model) else ("1", *(f"{u}/s" for u in places)))
+
+
+def rubs(site: str, model: gc.Model) -> bool:
+    """May wet friction act there: does something move, or is it a coordinate, whatever it is measured in?"""
+    return _mechanical(model) or moves(site, model)
 
 
 def _turning(site: str, model: gc.Model) -> bool:
