@@ -30,7 +30,7 @@ from .residual import unexplained as leftover
 from .residual.adequacy import blind, close
 from .residual.pushes import elsewhere, pushes
 from .results import Cause, Diagnosis, Estimate, Misfit, Push, Rival, Verdict
-from .search.alternatives import Answer, answered, decided, flags, unit_slip
+from .search.alternatives import Answer, answered, completed, decided, flags, unit_slip
 from .search.candidates import Candidate, Library
 from .search.criterion import noise, without
 from .search.engine_settings import Setting, Settled, across
@@ -260,11 +260,13 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
     def near(share: float) -> bool:
         return close(judge, answer.fit, seed, share)
 
+    beyond, before = (float(np.sum(np.maximum(judge.floors(f) ** 2 - 1, 0.0))) for f in (answer.fit, answer.nothing))
+    stays = beyond / max(before, 1e-300)
     laws = len(answer.causes) + len(settings) + len(answer.library.seen)
     verdict: Verdict = "unexplained"
     if left is not None:
-        verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, undecided, odd, near)
-        named = tuple(replace(c, flags=(*c.flags, *leftover.doubts(laws, left))) for c in named)
+        verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, undecided, odd, near, stays)
+        named = tuple(replace(c, flags=(*c.flags, *leftover.doubts(laws, left, len(settings)))) for c in named)
     if pushed and verdict == "nothing":
         verdict = "unexplained"
     lap("leftover")
@@ -305,7 +307,12 @@ def _judged(
     """The answer as held-out data have it, and rollouts over these, with inputs held as it holds them."""
     answer = answered(settled.search, settled.found, windows)
     judges = stretches(replace(held, hold=answer.dataset.hold), problem.horizons, answer.fit)
-    return decided(answer, judges[-1], problem.seed), judges
+    answer = decided(answer, judges, problem.seed)
+    if (more := completed(settled.search, answer, judges[-1], problem.seed)) is not None:
+        larger = decided(answered(settled.search, more, windows), judges, problem.seed)
+        if judges[-1].error(larger.fit) < judges[-1].error(answer.fit):
+            answer = replace(larger, chosen=True)
+    return answer, judges
 
 
 def _chosen(answer: Answer) -> tuple[str, ...]:
@@ -328,6 +335,8 @@ def _settled(data: Data, problem: DiagnosisProblem) -> tuple[Settled, Windows]:
     if length < THRESHOLDS.longer_window * data.windows.length:
         return first, data.windows
     again = across(data.library, problem.effects, windows, tell)
+    if judge.error(again.search.nothing) <= judge.error(again.found[1]):
+        again = replace(again, found=((), again.search.nothing))
     one, two = (float(np.sum(np.maximum(judge.floors(f) ** 2 - 1, 0.0))) for f in (again.found[1], found))
     return (again, windows) if one < THRESHOLDS.foretold_share**2 * two else (first, data.windows)
 

@@ -132,6 +132,71 @@ class JointCoupling(Law):
         return Extension(self.name, site, (c,), force=f"-{c.name}*{neighbour(site, model)}_dot")
 
 
+# A period that is wrong by p²/range is out of step at one end: slopes need steps far below that.
+_PERIOD = EffectParameter(
+    "period", {"position_range": 1}, (0.2,), 1 / THRESHOLDS.finest_turns, 1 / THRESHOLDS.min_turns, off=1.0, step=2e-4
+)
+_WAVES = tuple(
+    EffectParameter(f"{name}_{k}", dimension, starts, low, high)
+    for k in (1, 2, 3)
+    for name, dimension, starts, low, high in (
+        ("amplitude", {"force": 1}, (0.1 / k,), -3.0, 3.0),
+        ("phase", {"angle": 1}, (0.1,), -10.0, 10.0),
+    )
+)
+
+
+def _map(order: str) -> str:
+    """Three waves, of which the k-th has k·order periods in one of the parameter."""
+    waves = (f"{{amplitude_{k}}}*sin({k}*{order}*2*pi*{{q}}/{{period}} + {{phase_{k}}})" for k in (1, 2, 3))
+    return " + ".join(waves)
+
+
+class _Map(Law):
+    """What forms of cogging share that repeat themselves with more than one wave."""
+
+    variant_of = "cogging"
+    parameters = (_PERIOD, *_WAVES)
+    where = (placed, moves)
+    signature = "slow motion is uneven in a pattern of places, which repeats itself and is no plain wave"
+    experiment = "move slowly and evenly over the whole range: the pattern is that of the place, not of the time"
+    family = "cogging"
+    rivals: ClassVar = {"cubic-spring": PLACES, "coulomb-friction": PLACES, "linear-spring": PLACES}
+
+    def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
+        """Few and long periods, half a turn apart at the ends of the range: of short ones the strongest wave is found first."""
+        waves = [p.starts[0] * p.scale(scales) for p in _WAVES]
+        return [(scales["position_range"] / (1.05 * THRESHOLDS.min_turns + 0.5 * k), *waves) for k in range(11)]
+
+    def canonical(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Positive amplitudes, and phases within half a turn."""
+        out = dict(values)
+        for k in (1, 2, 3):
+            wave = {"amplitude": values[f"amplitude_{k}"], "phase": values[f"phase_{k}"]}
+            out |= {f"{n}_{k}": v for n, v in _turned(wave).items()}
+        return out
+
+
+@final
+class CoggingOvertones(_Map):
+    """f = Σ Aₖ·sin(2πk·q/p + φₖ), k = 1, 2, 3."""
+
+    name = "cogging-overtones"
+    equation = "f = Σ amplitude_k·sin(2π·k·q/period + phase_k), k = 1, 2, 3"
+    adds: ClassVar = {"force": _map("1")}
+    contains: ClassVar = {"cogging": {"period": "period", "amplitude_1": "amplitude", "phase_1": "phase"}}
+
+
+@final
+class CoggingHalves(_Map):
+    """f = Σ Aₖ·sin(πk·q/p + φₖ), k = 1, 2, 3: the second wave, which may be the strongest, has the period p."""
+
+    name = "cogging-halves"
+    equation = "f = Σ amplitude_k·sin(π·k·q/period + phase_k), k = 1, 2, 3"
+    adds: ClassVar = {"force": _map("0.5")}
+    contains: ClassVar = {"cogging": {"period": "period", "amplitude_2": "amplitude", "phase_2": "phase"}}
+
+
 @final
 class Cogging(Law):
     """f = A·sin(2π·q/p + φ): teeth and magnets."""
@@ -139,10 +204,7 @@ class Cogging(Law):
     name = "cogging"
     parameters = (
         EffectParameter("amplitude", {"force": 1}, (0.1,), -3.0, 3.0),
-        # A period that is wrong by p²/range is out of step at one end: slopes need steps far below that.
-        EffectParameter(
-            "period", {"position_range": 1}, (0.2,), 1 / THRESHOLDS.finest_turns, 1 / THRESHOLDS.min_turns, off=1.0, step=2e-4
-        ),
+        _PERIOD,
         EffectParameter("phase", {"angle": 1}, (0.1,), -10.0, 10.0),
     )
     equation = "f = amplitude·sin(2π·q/period + phase)"
@@ -152,6 +214,7 @@ class Cogging(Law):
     experiment = "move slowly and evenly over the whole range: the pattern is that of the place, not of the time"
     amplitude = "amplitude"
     family = "cogging"
+    variants = (CoggingOvertones, CoggingHalves)
     rivals: ClassVar = {"cubic-spring": PLACES, "coulomb-friction": PLACES, "linear-spring": PLACES}
 
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
@@ -181,9 +244,12 @@ class Cogging(Law):
 
     def canonical(self, values: Mapping[str, float]) -> dict[str, float]:
         """A positive amplitude, and a phase within half a turn."""
-        phase = values["phase"] + (math.pi if values["amplitude"] < 0 else 0.0)
-        turned = math.remainder(phase, 2 * math.pi)
-        return {**values, "amplitude": abs(values["amplitude"]), "phase": turned}
+        return {**values, **_turned(values)}
+
+
+def _turned(wave: Mapping[str, float]) -> dict[str, float]:
+    phase = wave["phase"] + (math.pi if wave["amplitude"] < 0 else 0.0)
+    return {"amplitude": abs(wave["amplitude"]), "phase": math.remainder(phase, 2 * math.pi)}
 
 
 _PHASES = (0.0, 0.5 * math.pi)
@@ -236,7 +302,7 @@ class WheelSlip(Law):
     parameters = (EffectParameter("traction", {"force_peak": 1}, (0.3, 0.8), 0.02, 5.0, off=NEVER),)
     equation = "F′ = traction·tanh(F/traction) of the applied F"
     adds: ClassVar = {"force": "{traction}*tanh({f}/{traction}) - {f}"}
-    where = (driven, straight)
+    where = (driven, straight, moves)
     signature = "hard acceleration and braking are weaker than commanded, gentle ones are right"
     experiment = SMALL_AND_LARGE
     family = "limit"

@@ -9,7 +9,7 @@ from typing import ClassVar, final
 from gapcert.plugin import EffectParameter, Memory
 
 from .experiments import BOTH_WAYS, CREEP, FREE_DECAY, LOADS, REST, VARY_SPEED
-from .law import Law, driven, moves, placed, spread
+from .law import Law, driven, moves, placed, rubs, spread
 
 _COEFFICIENT = {"force": 1, "velocity": -1}
 
@@ -37,6 +37,7 @@ class ViscousFriction(Law):
     parameters = (_wet("coefficient"),)
     equation = "f = −coefficient·v"
     adds: ClassVar = {"force": "-{coefficient}*{v}"}
+    where = (rubs,)
     signature = "swings lose a constant share of their amplitude per period"
     experiment = VARY_SPEED
     amplitude = "coefficient"
@@ -57,6 +58,7 @@ class AsymmetricViscousFriction(Law):
     parameters = (_wet("plus"), _wet("minus"))
     equation = "f = −plus·v if v > 0, else −minus·v"
     adds: ClassVar = {"force": "-{plus}*max({v}, 0) - {minus}*min({v}, 0)"}
+    where = (rubs,)
     signature = "swings lose a constant share of their amplitude, more in one direction than in the other"
     experiment = BOTH_WAYS
     family = "viscous"
@@ -80,6 +82,7 @@ class QuadraticDrag(Law):
     parameters = (_wet("coefficient", {"force": 1, "velocity": -2}),)
     equation = "f = −coefficient·v·|v|"
     adds: ClassVar = {"force": "-{coefficient}*{v}*abs({v})"}
+    where = (rubs,)
     signature = "large swings are damped strongly, small ones hardly"
     experiment = VARY_SPEED
     amplitude = "coefficient"

@@ -13,7 +13,7 @@ from gapcert.plugin import EffectParameter, Extension, Memory, site_units
 from gapcert_effects.thresholds import THRESHOLDS
 
 from .experiments import BOTH_WAYS, FAST, FREE_DECAY, LEVELS, REVERSALS, SECOND, SMALL_AND_LARGE
-from .law import NEVER, Law, spread, times
+from .law import NEVER, Law, graded, spread, times
 
 
 def _lagging(target: str) -> tuple[str, str]:
@@ -37,6 +37,7 @@ def _time_constant(*starts: float, name: str = "time_constant") -> EffectParamet
     return EffectParameter(name, {"period": 1}, starts, 0.0, float("inf"), longest=THRESHOLDS.slowest_lag)
 
 
+_RATE = EffectParameter("rate", {"input_rate": 1, "time": -1}, (0.3, 1.5), 1e-4, 1e5, off=NEVER)
 _MOVED = "min(max({u} - {memory}, -{rate}*{h}), {rate}*{h})"
 """By how much a ramp of limited rate comes nearer in a sub-step."""
 _ARRIVED, _DRAINED = _lagging("{u}"), _lagging("abs({u})")
@@ -146,7 +147,7 @@ class InputCurve(Law):
     signature = "every level of the input acts as its own one, at any speed and from either side"
     experiment = LEVELS
     family = "curve"
-    stage = 25
+    stage = 35
     contains: ClassVar = _STRAIGHT
     rivals: ClassVar = {"input-dead-zone": LEVELS, "input-saturation": LEVELS, "input-gain": LEVELS, "supply-sag": LEVELS}
     reach = 1.0
@@ -202,7 +203,7 @@ class InputNonlinearity(Law):
     signature = "every level of the input acts as its own one, at any speed and from either side"
     experiment = LEVELS
     family = "curve"
-    stage = 25
+    stage = 35
     variants = (InputCurve,)
     rivals: ClassVar = {"input-dead-zone": LEVELS, "input-saturation": LEVELS, "input-gain": LEVELS, "supply-sag": LEVELS}
 
@@ -242,13 +243,19 @@ class InputHysteresis(Law):
         return [(w * scales["input"],) for w in spread(0.02, 0.9, 9)]
 
 
+def _rates(scales: Mapping[str, float]) -> tuple[float, ...]:
+    """From what the input never comes to, a fifth of its mean rate or ten ramps in all the data, to its fastest change."""
+    slow = min(0.2 * scales["input_rate"], 10 * scales["input_peak"] / scales["duration"])
+    return graded(slow, max(0.9 * scales["input_rate_peak"], 2 * slow))
+
+
 @final
 class InputRateLimit(Law):
     """u acts as r, |ṙ| ≤ R, as the exact mean of its ramp over each sub-step: r + δ·(1 − |δ|/(2Rh)), δ = clip(u − r, ±Rh)."""
 
     name = "input-rate-limit"
     site = "input"
-    parameters = (EffectParameter("rate", {"input": 1, "time": -1}, (2.0, 20.0), 0.02, 2e4, off=NEVER),)
+    parameters = (_RATE,)
     equation = "r acts, ṙ = ±rate until r = u"
     memory = Memory("{rate}_reached", "{input}", f"{{memory}} + {_MOVED}")
     adds: ClassVar = {"input": f"{{memory}} + ({_MOVED})*(1 - abs({_MOVED})/(2*{{rate}}*{{h}}))"}
@@ -259,8 +266,7 @@ class InputRateLimit(Law):
     rivals: ClassVar = {"input-lag": SMALL_AND_LARGE, "input-delay": SMALL_AND_LARGE, "input-saturation": FAST}
 
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
-        """From a ramp of 2 s to one that takes two samples, for the largest input."""
-        return [(r * scales["input_peak"],) for r in spread(0.5, max(5.0, 0.5 / scales["period"]), 12)]
+        return [(rate,) for rate in _rates(scales)]
 
 
 @final
@@ -272,10 +278,7 @@ class InputRateLimitedLag(Law):
 
     name = "input-rate-limited-lag"
     site = "input"
-    parameters = (
-        EffectParameter("rate", {"input": 1, "time": -1}, (2.0, 10.0), 0.02, 2e4, off=NEVER),
-        _time_constant(2.0, 5.0),
-    )
+    parameters = (_RATE, _time_constant(2.0, 5.0))
     equation = "r acts, ṙ = clip((u − r)/time_constant, ±rate)"
     signature = "large steps become ramps with a rounded end, small ones arrive rounded"
     experiment = SMALL_AND_LARGE
@@ -285,8 +288,8 @@ class InputRateLimitedLag(Law):
     rivals: ClassVar = {"input-rate-limit": SMALL_AND_LARGE, "input-lag": SMALL_AND_LARGE, "input-delay": FAST}
 
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
-        """Ramps of the largest input in 1 s and less, with a lag of some share of that time."""
-        return [(r * scales["input_peak"], share / r) for r in (1.0, 4.0, 16.0) for share in (0.06, 0.25, 0.8)]
+        """With a lag of some share of the time in which the largest input is reached."""
+        return [(r, share * scales["input_peak"] / r) for r in _rates(scales)[1::3] for share in (0.06, 0.25, 0.8)]
 
     def extension(self, site: str, model: gc.Model) -> Extension:
         rate, time = (p.name for p in self.named(site, model))

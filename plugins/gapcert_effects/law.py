@@ -11,12 +11,11 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 import gapcert as gc
-from gapcert.plugin import Effect, EffectParameter, Extension, Memory, site_units
+from gapcert.plugin import Effect, EffectParameter, Extension, Memory, magnitude, site_units
 from gapcert_effects.plugin import SENTENCES
 from gapcert_effects.thresholds import THRESHOLDS
 
 _LENGTHS = ("m", "mm", "cm", "km")
-_TURNS = ("rad", "deg", "rev", "turn", "rpm")
 NEVER = 1e15  # a limit that nothing reaches; exact in min and max, and within rounding elsewhere
 _SITE = {name: f"{{{name}}}" for name in "qvufyth"}
 """Placeholders of an Extension, which the model fills."""
@@ -59,11 +58,15 @@ def spread(low: float, high: float, count: int) -> tuple[float, ...]:
     return tuple(float(v) for v in np.geomspace(low, high, count))
 
 
+def graded(low: float, high: float) -> tuple[float, ...]:
+    """Numbers from low to high, each at most `next_time` times the one before."""
+    return spread(low, high, 1 + math.ceil(math.log(high / low) / math.log(THRESHOLDS.next_time)))
+
+
 def times(parameter: EffectParameter, scales: Mapping[str, float], share: float = 0.9) -> tuple[float, ...]:
     """From half a period of sampling to this share of the longest time that a parameter may take."""
     high = share * parameter.bounds(scales)[1]
-    low = min(0.5 * scales["period"], 0.5 * high)
-    return spread(low, high, 1 + math.ceil(math.log(high / low) / math.log(THRESHOLDS.next_time)))
+    return graded(min(0.5 * scales["period"], 0.5 * high), high)
 
 
 def driven(site: str, model: gc.Model) -> bool:
@@ -95,8 +98,24 @@ def straight(site: str, model: gc.Model) -> bool:
 
 
 def moves(site: str, model: gc.Model) -> bool:
-    """Does something move there, by its unit: is it a length, an angle or a pure number, or how fast one changes?"""
-    return straight(site, model) or {s.name: s.unit for s in model.states}[site].removesuffix("/s") in (*_TURNS, "1")
+    """Does something move there, by its unit: is the coordinate a length, an angle or a pure number, or the state a speed?
+
+    Levels, temperatures, pressures and charges are no speeds.
+    """
+    unit = {s.name: s.unit for s in model.states}[site]
+    return unit == "1" or any(_fits(unit, known) for known in (("m", "rad") if _mechanical(model) else ("m/s", "rad/s")))
+
+
+def _fits(unit: str, other: str) -> bool:
+    try:
+        return bool(magnitude(f"1 {unit}", other))
+    except ValueError:
+        return False
+
+
+def rubs(site: str, model: gc.Model) -> bool:
+    """May wet friction act there: does something move, or is it a coordinate, whatever it is measured in?"""
+    return _mechanical(model) or moves(site, model)
 
 
 def _turning(site: str, model: gc.Model) -> bool:

@@ -155,6 +155,9 @@ def test_what_was_measured_before_a_part_can_be_had_with_it():
     _, block = whole.split({"from": 3.0, "to": 6.0})
     led_up, since = whole.led_up(block)
     assert (len(led_up.trajectories[0]), since) == (60, (3.0,))
+    twice = Recording.of(np.r_[0.0, t], {"q": np.sin(np.arange(101))})
+    _, part = twice.split({"last": 0.25})
+    assert len(twice.led_up(part)[0].trajectories[0]) == 101  # a stamp that comes twice sets no clock back
     back = Recording.of(np.r_[t[:50], t[:50]], {"q": np.sin(np.arange(100))})
     _, part = back.split({"last": 0.25})
     assert len(back.led_up(part)[0].trajectories[0]) == 25  # a clock that was reset: what came before is not known

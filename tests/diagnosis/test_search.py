@@ -234,6 +234,26 @@ def test_teeth_far_finer_than_the_range_are_found_and_their_side_lobes_are_not()
     assert abs(answer.fit.values["cogging_q_amplitude"]) == pytest.approx(0.15, rel=0.03)
 
 
+@pytest.mark.exam
+@pytest.mark.parametrize(("one", "two"), [(0.15, 0.07), (0.07, 0.15)])
+def test_waves_of_one_map_are_one_cause_whichever_is_the_strongest(one, two):
+    parameters = {"J": {"value": "2e-3 kg*m^2", "tolerance": "4 %"}, "b": "0.02 N*m*s/rad"}
+    spindle = {**ROD, "parameters": parameters, "mass_matrix": [["J"]], "bias": {"q": "b*q_dot"}}
+    teeth = {"A": f"{one} N*m", "B": f"{two} N*m"}
+    toothed = {"parameters": parameters | teeth, "bias": {"q": "b*q_dot - A*sin(2*q + 0.4) - B*sin(4*q + 1.0)"}}
+    u = 0.9 * multisine(T * PERIOD, PERIOD, 1.0, (0.1, 0.7), 8)
+    _, log = simulated({**spindle, **toothed}, noise=1e-3, seed=5, u=u)
+    answer = named(equations(spindle), log, [find(n) for n in ("cogging", "coulomb-friction", "cubic-spring")])
+    assert [c.told for c in answer.causes] == [("cogging", "q")]
+    (c,) = answer.causes
+    numbers = {p.name: answer.fit.values[n] for n, p in answer.library.parameters(c).items()}
+    period = numbers["period"] * (2.0 if c.effect.name == "cogging-halves" else 1.0)
+    assert period == pytest.approx(np.pi, rel=1e-3)
+    shown = c.effect.canonical(numbers)
+    assert [shown[f"amplitude_{k}"] for k in (1, 2)] == [pytest.approx(a, rel=0.05) for a in (one, two)]
+    assert shown["amplitude_3"] < 0.01
+
+
 def test_a_number_that_reaches_the_length_of_the_data_is_told_so():
     model, log = simulated(ROD, [("supply-sag", "u", (0.2, 400.0))], noise=1e-3, seed=2)
     library, windows = prepared(model, log, [find("supply-sag")])

@@ -1,10 +1,15 @@
 """What happens to an input on its way, as it is told: on ovens, valves and carts, simulated by hand in fine steps."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import gapcert as gc
 from gapcert_diagnosis import diagnose
+from gapcert_diagnosis.data.dataset import Dataset
+from gapcert_diagnosis.fitting.fit import fit
+from gapcert_diagnosis.search.candidates import Library
 from gapcert_diagnosis.testing import equations
 
 FINE = 20
@@ -133,6 +138,65 @@ def test_play_of_an_input_is_hysteresis_and_of_the_only_force_as_well_backlash()
     cart = told(CART, 5 * commands(1500, 60, 10), lambda u, h: played(u, 0.6))
     assert only(cart, "backlash") == {"width": pytest.approx(0.6, rel=0.05)}
     assert cart.ambiguous_with == ((("input-hysteresis", "f"),),)
+
+
+@pytest.mark.exam
+@pytest.mark.parametrize("bends", [True, False])
+def test_a_valve_that_bends_and_plays_is_found_though_it_rumbles(bends):
+    """Its levels are held for so long that the free starts of windows hide the play, and its noise grows with what it does."""
+    steps = np.linspace(0, 6, 8)
+    u = np.repeat(np.concatenate([steps, steps[-2::-1], steps[1:] - 0.1, steps[-2::-1]]), 150)
+    x, path = 0.0, []
+    for level in 0.7 * np.tanh(played(u, 0.12) / 3.6) * 3.6 if bends else 0.7 * u:
+        path.append(x)
+        x = level + (x - level) * np.exp(-0.05 / 0.2)
+    rumble = np.random.default_rng(3).standard_normal(len(u)) * (0.003 + 0.004 * np.array(path))
+    model = equations(
+        {"kind": "equations", "integrator": "rk4", "states": {"y": "V"}, "inputs": {"u": "V"}, "period": "50 ms"}
+        | {"parameters": {"k": {"value": "0.65", "tolerance": "20 %"}, "tau": {"value": "0.2 s", "tolerance": "50 %"}}}
+        | {"derivative": {"y": "(k*u - y)/tau"}}
+    )
+    recording = gc.Recording.of(np.arange(len(u)) * 0.05, {"y": np.array(path) + rumble, "u": u}, hold="zero")
+    found = diagnose(model, recording, horizons=[2.0, 10.0])
+    named = {c.effect: c for c in found.causes}
+    if not bends:
+        assert found.verdict == "nothing"
+        return
+    assert found.verdict == "causes"
+    assert set(named) - {"input-nonlinearity", "input-saturation"} == {"input-hysteresis"}
+    assert named["input-hysteresis"].parameters["width"].value == pytest.approx(0.12, rel=0.3)
+    assert found.gain["10"]["y"].after < 0.03 * np.std(path)
+
+
+@pytest.mark.parametrize(("plant", "peak", "rate"), [(OVEN, 9.0, 0.06), (VALVE, 1.0, 1.5)])
+def test_a_rate_is_looked_for_on_the_scale_of_the_log(plant, peak, rate):
+    def acting(u, h):
+        out, r = np.empty_like(u), 0.0
+        for k, level in enumerate(u):
+            new = r + np.clip(level - r, -rate * h, rate * h)
+            out[k], r = (r + new) / 2, new
+        return out
+
+    u = peak * commands(1000, 50, 14, low=-1.0 if plant is VALVE else 0.0)
+    assert only(told(plant, u, acting), "input-rate-limit") == {"rate": pytest.approx(rate, rel=0.05)}
+
+
+def test_the_edge_of_a_force_moves_out_and_that_of_a_time_does_not():
+    model = equations({"kind": "equations", "integrator": "rk4", **CART[0]})
+    u = commands(400, 40, 15)
+    recording = gc.Recording.of(np.arange(400) * 0.01, {"x": np.cumsum(u) * 1e-4, "f": u}, hold="zero")
+    effects = [gc.registry().build("effect", n) for n in ("constant-force", "input-lag", "input-saturation")]
+    library = Library(model, Dataset.of(model, recording), effects)
+    windows = library.measured.windows(40)
+    for c in library.candidates:
+        h = library.hypothesis((c,))
+        i = [h.names.index(n) for n in library.names(c)]
+        at_edge = replace(fit(h, windows, iterations=0), theta=h.high)
+        further = library.further((c,), at_edge)
+        if c.effect.name == "constant-force":
+            assert further.high[i] == pytest.approx(10 * h.high[i])
+        else:  # a time is limited by the log, and above its highest level nothing saturates
+            assert further is None or (further.high[i] == h.high[i]).all()
 
 
 @pytest.mark.parametrize("hard", [True, False])

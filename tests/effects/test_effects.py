@@ -224,14 +224,18 @@ def plant(unit, mechanical):
 
 
 DRY = {"coulomb-friction", "stribeck-friction", "asymmetric-coulomb-friction", "load-dependent-friction", "cogging"}
+WET = {"viscous-friction", "asymmetric-viscous-friction", "quadratic-drag"}
 
 
 @pytest.mark.parametrize("mechanical", [True, False])
-@pytest.mark.parametrize(("unit", "moving"), [("m", True), ("rad", True), ("K", False), ("V", False), ("Pa", False)])
-def test_what_only_bodies_do_is_offered_only_where_something_moves(unit, moving, mechanical):
-    model = plant(unit if mechanical or not moving else f"{unit}/s", mechanical)
+@pytest.mark.parametrize("unit", ["m", "rad", "m/s", "rad/s", "1", "K", "V", "Pa", "C", "m^3"])
+def test_what_only_bodies_do_is_offered_only_where_something_moves(unit, mechanical):
+    """A level in m is no speed, and stands still as a charge, a pressure and a temperature do."""
+    moving = unit in (("m", "rad", "1") if mechanical else ("m/s", "rad/s", "1"))
+    model = plant(unit, mechanical)
     offered = {n for n in gc.registry().names("effect") if gc.registry().build("effect", n).site == "coordinate"}
     offered = {n for n in offered if gc.registry().build("effect", n).applies("q", model)}
     named = DRY if mechanical else DRY - {"cogging"}
     assert offered & DRY == (named if moving else set())
-    assert {"viscous-friction", "constant-force", "external-push"} <= offered
+    assert offered & WET == (WET if mechanical or moving else set())
+    assert {"constant-force", "external-push"} <= offered

@@ -146,26 +146,36 @@ def _share(motion: Tangent, sites: tuple[str, ...], excess: float, channel: int 
 
 
 def verdict(
-    causes: int, found: Left, last: Fit, nothing: Fit, undecided: bool, doubted: bool, near: Callable[[float], bool]
+    causes: int,
+    found: Left,
+    last: Fit,
+    nothing: Fit,
+    undecided: bool,
+    doubted: bool,
+    near: Callable[[float], bool],
+    rest: float = 0.0,
 ) -> Verdict:
     """causes: how many are named; nothing: the fit without them; undecided: are there rivals that an experiment tells apart?
 
     doubted: has a cause a number that is not plausible, or is nothing of the motion followed, however little force would do so?
-    near: are held-out rollouts within noise, or within such a share of the motion? Causes have to leave little, of the excess
-    over noise and of the motion, to be the answer where something is left beside them.
+    near: are held-out rollouts within noise, or within such a share of the motion? rest: of the excess over noise that these
+    have without causes, what these leave. Causes have to leave little, of the excess over noise and of the motion, to be the
+    answer where something is left beside them.
     """
-    adequate = causes and last.chi.mean() - 1 < THRESHOLDS.adequate_rest * (nothing.chi.mean() - 1)
+    few, quiet = THRESHOLDS.adequate_rest, bool((np.sqrt(last.chi) <= THRESHOLDS.loud_channel).all())
+    adequate = causes and (last.chi.mean() - 1 < few * (nothing.chi.mean() - 1) or (quiet and rest < few))
     if doubted or (found.remains and not adequate):
         return "unexplained"
-    if found.coherent and not last.windows.measured.exact and not near(THRESHOLDS.close_motion if causes else 0.0):
+    helped = causes and (adequate or rest < (1 - THRESHOLDS.little_force_share[0]) ** 2)
+    if found.coherent and not last.windows.measured.exact and not near(THRESHOLDS.close_motion if helped else 0.0):
         return "unexplained"
     if not causes:
         return "nothing"
     return "ambiguous" if undecided else "causes"
 
 
-def doubts(causes: int, found: Left) -> tuple[str, ...]:
-    """Why named causes may be stand-ins, as sentences."""
+def doubts(causes: int, found: Left, settings: int = 0) -> tuple[str, ...]:
+    """Why named causes may be stand-ins, as sentences; settings of an engine, among them, are no part of a composite."""
     out = []
     if causes and found.coherent and found.share > THRESHOLDS.faint_force:
         best = found.best
@@ -177,8 +187,8 @@ def doubts(causes: int, found: Left) -> tuple[str, ...]:
         out.append(
             f"inadequate: what is left goes with {found.lack.kind} ({found.lack.sigmas:.2g} standard deviations of noise)"
         )
-    if causes >= THRESHOLDS.several_causes:
-        out.append(f"composite: {causes} causes together are often stand-ins for one law that the library lacks")
+    if causes - settings >= THRESHOLDS.several_causes:
+        out.append(f"composite: {causes - settings} causes together are often stand-ins for one law that the library lacks")
     return tuple(out)
 
 

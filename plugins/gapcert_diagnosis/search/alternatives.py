@@ -8,16 +8,16 @@ from typing import final
 
 import numpy as np
 
-from gapcert.plugin import Model
+from gapcert.plugin import Array, Model
 from gapcert_diagnosis.data.dataset import Dataset, Windows
 from gapcert_diagnosis.fitting.fit import Fit
 from gapcert_diagnosis.fitting.rollout_error import Stretches
-from gapcert_diagnosis.residual.adequacy import by_noise
+from gapcert_diagnosis.residual.adequacy import by_noise, close
 from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_engines import EngineModel
 
 from .candidates import Candidate, Causes, Library
-from .criterion import Found, ahead, fails, keys, rank, richer, without
+from .criterion import Found, agreement, ahead, fails, keys, rank, richer, without
 from .fitted_sets import FittedSets
 from .moves import additions, spared
 from .stepwise import judge
@@ -80,16 +80,19 @@ def answered(search: FittedSets, found: Found, windows: Windows) -> Answer:
     return _told(answer if simplest[0] == causes else answer.with_answer(simplest))
 
 
-def decided(answer: Answer, judge: Stretches, seed: int) -> Answer:
+def decided(answer: Answer, judges: Sequence[Stretches], seed: int) -> Answer:
     """As held-out data have it: a tie that foretells them plainly worse is none, one that does so plainly better is the answer,
-    and a rival that does is a tie."""
+    and a rival that does is a tie. The longest rollouts say how much worse, and those of any horizon how surely."""
+    judge = judges[-1]
     ties = {keys(f[0]): f for f in answer.ties}
     if judge.windows.measured.exact:
         return answer
 
     def foretells(new: Fit, old: Fit) -> bool:
-        errors = judge.floors(new), judge.floors(old), judge.blocks(new), judge.blocks(old)
-        return ahead(*errors, lambda: [by_noise(judge, f, seed) for f in (new, old)])
+        def due() -> list[Array]:  # what a rough fit leaves is no noise
+            return [np.ones(1) if f.rough else by_noise(judge, f, seed) for f in (new, old)]
+
+        return any(ahead(judge.floors(new), judge.floors(old), j.blocks(new), j.blocks(old), due) for j in judges)
 
     runners_up = [f for found in answer.rivals.values() for f in found[:1] if keys(f[0]) not in ties]
     surprising = [f for f in runners_up if foretells(f[1], answer.fit)]
@@ -101,6 +104,39 @@ def decided(answer: Answer, judge: Stretches, seed: int) -> Answer:
         return answer
     answer = replace(answer.with_answer(min(better, key=lambda f: judge.error(f[1]))), chosen=True)
     return replace(answer, ties=tuple(f for f in answer.ties if not foretells(answer.fit, f[1])))
+
+
+def completed(search: FittedSets, answer: Answer, judge: Stretches, seed: int) -> Found | None:
+    """The causes, or the best single one, with one more, where with it only held-out rollouts are close to the motion.
+
+    Their error falls to a half, in all stretches alike, and falls plainly over the fitted data: of what promises most, what
+    foretells these best. A search on windows refuses it where the free starts of these hide much of what it does.
+    """
+    old, limit, far = answer.fit, THRESHOLDS.close_motion, search.far
+    if far is None or judge.windows.measured.exact or close(judge, old, seed, limit):
+        return None
+
+    def completes(new: Found) -> bool:
+        gone = np.log(judge.blocks(old) + 1e-300) - np.log(judge.blocks(new[1]) + 1e-300)
+        halved = (
+            judge.error(new[1]) < THRESHOLDS.completed_share * judge.error(old) and agreement(gone) > THRESHOLDS.sure_errors
+        )
+        plain = far.error(new[1]) < THRESHOLDS.foretold_share * far.error(old) and search.matters(new)
+        odd = any(_implausible(search.library, c, new[1]) for c in new[0])
+        return halved and plain and not odd and close(judge, new[1], seed, limit)
+
+    alone = _grown(search, ((), search.nothing))
+    bases = [(answer.causes, search.fit(answer.causes, None, old.values))] if answer.causes else []
+    bases += sorted(alone, key=lambda f: far.error(f[1]))[:1]
+    some = [*alone, *(f for base in bases for f in _grown(search, base))]
+    return next((f for f in sorted(some, key=lambda f: far.error(f[1])) if completes(f)), None)
+
+
+def _grown(search: FittedSets, base: Found) -> list[Found]:
+    """A set with each of the moves that promise most beside it."""
+    promised = [s for some in search.promises(base) for s in some[: THRESHOLDS.short_fits]]
+    moves = {keys(s.move): s.move for s in promised if not any(search.library.related(c, k) for c in s.move for k in base[0])}
+    return [(new, search.fit(new, base)) for new in ((*base[0], *move) for move in moves.values())]
 
 
 def _told(answer: Answer) -> Answer:
@@ -235,10 +271,10 @@ def unit_slip(library: Library, c: Candidate, fitted: Fit) -> str | None:
 
 def flags(library: Library, c: Candidate, fitted: Fit) -> tuple[str, ...]:
     """Sentences about numbers that are not plausible, or that lie at the edge of what was tried."""
-    known, out = fitted.values, list[str]()
+    known, h, out = fitted.values, fitted.hypothesis, list[str]()
     if (units := unit_slip(library, c, fitted)) is not None:
         out.append(f"a slip of units: {c.site} differs by the factor of {units}; is it in the log in the unit of the model?")
-    low, high = library.bounds(c)
+    low, high = dict(zip(h.names, h.low, strict=True)), dict(zip(h.names, h.high, strict=True))
     implausible = _implausible(library, c, fitted)
     for i, ((name, p), off) in enumerate(zip(library.parameters(c).items(), library.off(c), strict=True)):
         value, unit = known[name], f" {library.units(c)[i]}".removesuffix(" 1")
@@ -249,8 +285,8 @@ def flags(library: Library, c: Candidate, fitted: Fit) -> tuple[str, ...]:
             # A factor that does nothing at 1 (`off`) has no unit: its sign is a convention of the log.
             turned = not p.dimension and p.off == 1.0 and least <= -value <= most
             out.append(f"{said}; is the sign of {c.site} in the log the other way round than in the model?" if turned else said)
-        elif min(value - low[i], high[i] - value) < THRESHOLDS.at_bound * (high[i] - low[i]) and value != off:
-            least, most = value == low[i], high[i] < p.high * p.scale(library.scales(c))
+        elif min(value - low[name], high[name] - value) < THRESHOLDS.at_bound * (high[name] - low[name]) and value != off:
+            least, most = value == low[name], high[name] < p.high * p.scale(library.scales(c))
             said = "as long as the data, which tell no longer one from it" if most else "the most that was tried"
             out.append(f"at the edge: {p.name} = {value:.4g}{unit} is {'the least that was tried' if least else said}")
     return tuple(out)

@@ -13,6 +13,7 @@ import numpy as np
 
 from gapcert.plugin import Array, Effect, EffectParameter, Extension, Model, Parameter, difference, position
 from gapcert_diagnosis.data.dataset import Dataset, once
+from gapcert_diagnosis.fitting.fit import Fit
 from gapcert_diagnosis.fitting.hypothesis import Hypothesis
 from gapcert_diagnosis.fitting.linearised import sliding, velocity
 from gapcert_diagnosis.fitting.step_size import built
@@ -289,6 +290,25 @@ class Library:
             low, high = np.maximum(low, stated.low), np.minimum(high, stated.high)
         return low, high
 
+    def further(self, causes: Causes, fitted: Fit) -> Hypothesis | None:
+        """With the edges of levels and forces that numbers lie at ten times as far out; None where none does.
+
+        Not towards where a law does nothing, and not times, which the log limits.
+        """
+        h, low, high = fitted.hypothesis, fitted.hypothesis.low.copy(), fitted.hypothesis.high.copy()
+        for c in causes:
+            for name, p in self.parameters(c).items() if self.freed(c) is None else ():
+                i = h.names.index(name)
+                near = THRESHOLDS.at_bound * (high[i] - low[i])
+                if not p.dimension or {"time", "period", "angle"} & set(p.dimension):
+                    continue
+                if high[i] - fitted.theta[i] < near and p.off < high[i]:
+                    high[i] *= 10
+                elif fitted.theta[i] - low[i] < near and p.off > low[i] != 0:
+                    low[i] *= 10 if low[i] < 0 else 0.1
+        moved = np.any(low != h.low) or np.any(high != h.high)
+        return replace(h, low=low, high=high) if moved else None
+
     def within(self, a: Candidate, b: Candidate) -> bool:
         """Does the second law contain the first, at the same site?"""
         return a.site == b.site and self.contains(b.effect.name, a.effect.name)
@@ -390,8 +410,11 @@ def _scales(library: Library, c: Candidate, x: Array, u: Array) -> dict[str, flo
     }
     kind = c.effect.site
     if kind == "input":
-        own = u[:, [s.name for s in model.inputs].index(c.site)]
-        return times | _levels("input", own) | {"input_low": float(own.min()), "input_high": float(own.max())}
+        at = [s.name for s in model.inputs].index(c.site)
+        own = u[:, at]
+        rates = np.abs(np.concatenate([np.diff(a[:, at]) for a in measured.inputs])) / measured.period
+        found = {"input_rate": float(rates.mean()) or 1.0, "input_rate_peak": float(rates.max()) or 1.0}
+        return times | _levels("input", own) | found | {"input_low": float(own.min()), "input_high": float(own.max())}
     if kind == "output":
         y = np.concatenate(measured.outputs)[:, [s.name for s in measured.channels].index(c.site)]
         return times | _levels("output", y - np.nanmean(y))

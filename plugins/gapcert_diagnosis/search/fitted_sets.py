@@ -105,11 +105,20 @@ class FittedSets:
         return self._fits[keys(causes)][1]
 
     def _keep(self, causes: Causes, made: Fit) -> Fit:
-        """The better one of what was known, and of this once its lost windows are led back."""
-        new, old = rescued(made), self.known(causes)
+        """The better one of what was known, and of this once its lost windows are led back, and its edges moved."""
+        new, old = self._further(causes, rescued(made)), self.known(causes)
         if old is None or self.better(new, old) > 0:
             self._fits[keys(causes)] = causes, new
         return self._fits[keys(causes)][1]
+
+    def _further(self, causes: Causes, made: Fit) -> Fit:
+        """Fitted again while a level or a force ends at the edge of what is tried, with that edge further out."""
+        for _ in range(THRESHOLDS.moved_edges):
+            h = self.library.further(causes, made)
+            if h is None:
+                break
+            made = fit(h, self.windows, theta=made.theta, start=made.start)
+        return made
 
     def fit_shaken(self, causes: Causes, base: Found) -> Fit:
         """The best of a fit and of fresh ones from nearby: sticking puts kinks into the cost, and a fit may catch on one."""

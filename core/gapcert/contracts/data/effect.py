@@ -23,7 +23,7 @@ SiteKind = Literal["coordinate", "input", "output", "parameter", "contact"]
 class EffectParameter:
     """One number of an effect, in powers of what a site is measured in.
 
-    `dimension` maps force, velocity, position, input, output (the root mean square at the site), the same with `_peak`,
+    `dimension` maps force, velocity, position, input, output (the root mean square at the site), input_rate, each with `_peak`,
     position_range, time, period (of sampling), angle, mass and value (of a parameter) to exponents (empty: a pure number). It
     gives the unit at a site and, from the data there, the scale; `starts`, `low` and `high` are multiples of that scale (of
     1 s, 1 rad and 1 for times, angles and pure numbers). At `off`, in its unit, the effect does nothing; it may lie beyond the
@@ -93,9 +93,9 @@ class Effect(ABC):
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         """Values of all parameters, in their units, from which a search starts.
 
-        scales: root mean squares of force, velocity, position, input and output at the site, their `…_peak`s, the
-        `position_range`, `input_low` and `input_high`, and in s the `period` of sampling and the `start` and `duration` of the
-        data.
+        scales: root mean squares of force, velocity, position, input and output at the site, the mean `input_rate` per s, their
+        `…_peak`s, `position_range`, `input_low` and `input_high`, and in s the `period` of sampling and the `start` and
+        `duration` of the data.
         """
         return list(itertools.product(*([s * p.scale(scales) for s in p.starts] for p in self.parameters)))
 

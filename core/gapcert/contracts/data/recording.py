@@ -262,12 +262,12 @@ class Recording:
     def led_up(self, part: Recording) -> tuple[Recording, tuple[float, ...]]:
         """(the trajectories of a part with what was measured before them, when each part begins in s).
 
-        A model with memory needs that past. Where time does not go forward throughout, there is none.
+        A model with memory needs that past. Where time goes back, there is none.
         """
         whole, since = [], []
         for tr in part.trajectories:
             source = next((s for s in self.trajectories if tr.name == s.name or tr.name.startswith(f"{s.name} from ")), tr)
-            end = int(np.searchsorted(source.t, tr.t[-1], "right")) if bool((np.diff(source.t) > 0).all()) else 0
+            end = int(np.searchsorted(source.t, tr.t[-1], "right")) if bool((np.diff(source.t) >= 0).all()) else 0
             whole.append(replace(source.part(0, end), name=tr.name) if end >= len(tr) else tr)
             since.append(float(tr.t[0]))
         return self._with(whole), tuple(since)
