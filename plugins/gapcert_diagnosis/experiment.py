@@ -120,7 +120,7 @@ def design(
     name = _common(able)
     # Where no input is played for all of them, the pair that is hardest decides.
     hardest = min(able, key=lambda t: t.table[name].value if name else max(s.value for s in t.table.values()))
-    return _experiment(hardest, name or hardest.best(hardest.table) or "", trials), separable, besides
+    return _experiment(hardest, name or hardest.best(hardest.table) or "", trials, begin), separable, besides
 
 
 def _common(trials: Sequence[_Trial]) -> str | None:
@@ -312,8 +312,17 @@ class _Plays:
     """
 
     def __init__(self, fitted: Fit, measured: Dataset, begin: Array, held: Array) -> None:
-        self.fitted, self.measured, self.begin, self.held = fitted, measured, begin, held
-        self._hidden = _memory(fitted, begin[None], held[None], measured)
+        self.fitted, self.measured, self.held = fitted, measured, held
+        self._hidden, self.begin = _memory(fitted, begin[None], held[None], measured), begin
+        # A sensor that is off shows another state: what it shows is where the experiment begins.
+        states = [s.name for s in fitted.hypothesis.model.states]
+        shown = [(i, states.index(c.name)) for i, c in enumerate(measured.channels) if c.name in states]
+        rows, columns = np.array(shown, dtype=int).reshape(-1, 2).T
+        off = begin[columns] - self.outputs(held[None, None])[0, 0, rows]
+        self.begin = begin.copy()
+        self.begin[columns] += off
+        if not (np.abs(begin[columns] - self.outputs(held[None, None])[0, 0, rows]) <= np.abs(off)).all():
+            self.begin = begin
         self._logs: dict[int, tuple[Array, Dataset | None]] = {}
 
     def showing(self, column: int) -> _Plays:
@@ -386,15 +395,15 @@ def _within(plays: Sequence[_Plays], signals: Mapping[str, Array], limits: Limit
     room = THRESHOLDS.experiment_room * (high - low)
     held = plays[0].held
     begin = [p.outputs(held[None, None])[0, 0] for p in plays]
-    low, high = np.min([low + room, *begin], axis=0), np.max([high - room, *begin], axis=0)
+    lowest, highest = (np.array([f(end, b) for b in begin]) for f, end in ((np.minimum, low + room), (np.maximum, high - room)))
     fastest = recorded_speed([p.fitted for p in plays], measured) * [limits.wider.get(n, 1.0) for n in names] * measured.period
 
     def inside(u: Array) -> Array:
         """How many samples of each of u (n, T, nu) can be played."""
         good = np.ones(u.shape[:2], dtype=bool)
-        for p in plays:
+        for p, least_y, most_y in zip(plays, lowest, highest, strict=True):
             y = p.outputs(u)
-            good &= ((y >= low) & (y <= high)).all(axis=2)
+            good &= ((y >= least_y) & (y <= most_y)).all(axis=2)
             good[:, 1:] &= (np.abs(np.diff(y, axis=1)) <= fastest).all(axis=2)
         return np.asarray(np.cumprod(good, axis=1).sum(axis=1))
 
@@ -459,7 +468,7 @@ def joined(first: Dataset, second: Dataset) -> Dataset:
     return replace(first, **both, drives=drives, source=source)
 
 
-def _experiment(trial: _Trial, name: str, trials: Sequence[_Trial]) -> Experiment:
+def _experiment(trial: _Trial, name: str, trials: Sequence[_Trial], begin: Array) -> Experiment:
     pair, table, measured, model = trial.pair, trial.table, trial.measured, trial.pair.here.hypothesis.model
     for other in trials:
         other.judge([name] if name in other.table else [])
@@ -485,8 +494,8 @@ def _experiment(trial: _Trial, name: str, trials: Sequence[_Trial]) -> Experimen
         f"their predictions then differ by {chosen.told:.2g} times the noise, by {math.sqrt(chosen.expected):.2g} sigma in all"
     )
     others = {n: s.told for n, s in table.items() if n != name}
-    begin = [*trial.plays[0].begin.tolist(), *trial.plays[0].held.tolist()]
-    start = {s.name: (v, s.unit) for s, v in zip((*model.states, *model.inputs), begin, strict=True)}
+    values = [*begin.tolist(), *trial.plays[0].held.tolist()]
+    start = {s.name: (v, s.unit) for s, v in zip((*model.states, *model.inputs), values, strict=True)}
     predicted = {s.name: moved[..., i] for i, s in enumerate(measured.channels)}
     rivals, window = (pair.named, pair.other), trial.length * measured.period
     return Experiment(rivals, name, sentence, t, inputs, chosen.told, others, travel, apart, start, predicted, window)
