@@ -154,13 +154,19 @@ class _Separation:
     falls: tuple[float, float]
 
     @classmethod
-    def of(cls, u: Array, left: Sequence[Array], pair: Rivalry) -> _Separation:
-        """From what cannot be copied, (W, L, ny), in each direction. Coloured noise counts for less."""
+    def of(cls, u: Array, left: Sequence[Array], own: Sequence[Array], pair: Rivalry) -> _Separation:
+        """From what cannot be copied, (W, L, ny), in each direction, beyond what the copying rival misses of its own log.
+
+        Coloured noise counts for less.
+        """
         whiteness = np.minimum(pair.here.whiteness, pair.there.whiteness)
         if len(whiteness) < left[0].shape[2]:
             whiteness = np.full(left[0].shape[2], whiteness.min())
-        falls = [float(np.sum(r**2, axis=(0, 1)) @ whiteness) for r in left]
-        rms = [float(np.sqrt(np.mean(r**2))) for r in left]
+        beyond = [
+            np.maximum(np.sum(r**2, axis=(0, 1)) - np.sum(o**2, axis=(0, 1)), 0.0) for r, o in zip(left, own, strict=True)
+        ]
+        falls = [float(rest @ whiteness) for rest in beyond]
+        rms = [math.sqrt(float(rest.sum()) / r.size) for rest, r in zip(beyond, left, strict=True)]
         return cls(u, (rms[0], rms[1]), (falls[0], falls[1]))
 
     @property
@@ -198,17 +204,19 @@ class _Trial:
         self.table: dict[str, _Separation] = {}
         self._full: set[str] = set()
         for name, u in inputs.items():
-            if (found := self._looked(u, [p.log(u) for p in self.plays])) is not None:
+            if (found := self._looked(u, self.plays)) is not None:
                 self.table[name] = found
         # What looks best to first order may be less by full fits: until the best is one that has been judged so.
         for _ in range(THRESHOLDS.most_judged):
             self.judge([n for n in [self.best(self.table)] if n is not None])
 
-    def _looked(self, u: Array, logs: Sequence[Dataset | None]) -> _Separation | None:
+    def _looked(self, u: Array, plays: Sequence[_Plays]) -> _Separation | None:
         """To first order."""
-        turns = zip((self.pair.there, self.pair.here), logs, strict=True)
+        turns = zip((self.pair.there, self.pair.here), [p.log(u) for p in plays], strict=True)
         both = [_first_order(b, log.windows(self.length)) for b, log in turns if log]
-        return _Separation.of(u, both, self.pair) if len(both) == 2 else None
+        if len(both) < 2:
+            return None
+        return _Separation.of(u, both, [p.own(u, self.length) for p in reversed(plays)], self.pair)
 
     def besides(self, beyond: Sequence[Array]) -> str:
         """What would separate a pair that no input does: an output of the model that is not measured, inputs beyond the limits,
@@ -237,7 +245,7 @@ class _Trial:
         return ""
 
     def _settles(self, u: Array, plays: Sequence[_Plays]) -> bool:
-        found = self._looked(u, [p.log(u) for p in plays])
+        found = self._looked(u, plays)
         return found is not None and found.expected > THRESHOLDS.settled_fall
 
     def judge(self, names: Sequence[str]) -> None:
@@ -249,7 +257,8 @@ class _Trial:
                 _copied(rival, self.measured, play.log(u), self.length)
                 for play, (_, rival) in zip(self.plays, turns, strict=True)
             ]
-            self.table[name] = _Separation.of(u, both, pair)
+            own = [p.own(u, self.length) for p in reversed(self.plays)]
+            self.table[name] = _Separation.of(u, both, own, pair)
             self._full.add(name)
 
     def best(self, names: Iterable[str]) -> str | None:
@@ -366,8 +375,17 @@ class _Plays:
         own = np.std(y, axis=0)[known:]
         floor, spread = np.append(m.sigma, THRESHOLDS.further_noise * own), np.append(m.spread, own)
         back = np.argsort(order)
+        states = (self.states(u[None])[0],) if len(found.times) == 1 and len(found.times[0]) == len(u) else found.states
         # An experiment is played sample by sample, whatever the recording was.
-        return replace(found, sigma=floor[back], spread=spread[back], hold="zero")
+        return replace(found, sigma=floor[back], spread=spread[back], hold="zero", states=states)
+
+    def own(self, u: Array, length: int) -> Array:
+        """What its own windows (W, L, ny) miss of its log from the true starts: what is late is not known where they begin."""
+        log, f = self.log(u), self.fitted
+        assert log is not None
+        windows = log.windows(length)
+        y = f.hypothesis.simulate(windows, f.theta[None], windows.start[None])
+        return np.nan_to_num(difference(log.channels, y, windows.y[None])[0] / log.sigma * windows.weight)
 
 
 def _speed(y: Array, measured: Dataset) -> Array:
