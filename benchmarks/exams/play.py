@@ -1,6 +1,6 @@
 """Experiments: where an answer is ambiguous, the proposed input is played on the hidden system, from where it says.
 
-Every third case is a robot, the others are plants of another hand. Beside the answer to both logs stands how far the rivals of
+Every sixth case is a robot, the others are plants of another hand. Beside the answer to both logs stands how far the rivals of
 the truth then are apart without noise, and how far the motion left the range of the recording.
 """
 
@@ -27,13 +27,13 @@ Key = tuple[str, str]
 
 def experiment(seed: int, index: int, limit: float) -> Record:
     """The first answer; where it is ambiguous, the answer to it together with the log of the experiment."""
-    robot = index % 3 == 2
-    nth = index // 3 if robot else index - index // 3
+    robot = index % 6 == 5
+    nth = index // 6 if robot else index - index // 6
     case: Any = (draw if robot else plain).doubtful("experiments", seed, nth)
     asked = _question(case, index)
     log, horizons = case.recording(), sit.HORIZONS if robot else [case.rig.horizon]
-    # Half of them may go as far the other way as they went one way.
-    limits = _limits(case, log) if index % 2 else {}
+    # Most of them may go as far the other way as they went one way.
+    limits = _limits(case, log) if index % 3 else {}
     model, found = sit.model(case.model if robot else case.rig.section), list[gc.Diagnosis]()
 
     def first() -> Record:
@@ -49,7 +49,8 @@ def experiment(seed: int, index: int, limit: float) -> Record:
     record |= {"members": sorted(map(list, members))}
     fitted = log.split({"last": 0.25})[0]
     record["beyond"] = _beyond(model, fitted, limits, quiet)
-    record["apart"] = _apart(model, fitted, quiet, case.hidden[0].key, found[0])
+    fine = model if robot else sit.model(case.rig.section | {"substeps": case.rig.sub})
+    record["apart"] = _apart(fine, fitted, quiet, case.hidden[0].key, found[0])
     both = gc.Recording((*log.trajectories, replace(again, name="experiment")), hold=log.hold)
     record["designed"] = sit.timed(lambda: sit.answer(gc.diagnose(model, both, "all", horizons=horizons)), limit)
     return record
@@ -118,12 +119,11 @@ def _left(model: gc.Model, both: Dataset, alone: Dataset, key: Key, length: int)
     """RMS of the experiment's residual in noise floors, with one effect fitted to both logs, from its best fit to the first."""
     library = Library(model, alone, [gc.registry().build("effect", key[0])])
     c = next(c for c in library.candidates if c.key == key)
-    h, starts, windows = library.hypothesis((c,)), library.starts(c), alone.windows(length)
+    h, starts, windows = library.hypothesis((c,)), library.starts(c), both.windows(length)
     rows = np.tile(h.value, (len(starts), 1))
     rows[:, [h.names.index(n) for n in library.names(c)]] = starts
-    theta, start, _ = promising(h, windows, rows, windows.start)
-    first = fit(h, windows, theta=theta, start=start)
-    windows = both.windows(length)
-    again: Fit = fit(h, windows, theta=first.theta, iterations=15)
+    # From what the first log says alone, and from what both say.
+    first = [promising(h, w, rows, w.start)[0] for w in (alone.windows(length), windows)]
+    again: Fit = min((fit(h, windows, theta=theta) for theta in first), key=lambda f: float(f.chi.sum()))
     of = np.array([both.source[i] == max(both.source) for i in windows.place[:, 0]])
     return float(np.sqrt(np.mean(again.residual[of] ** 2)))

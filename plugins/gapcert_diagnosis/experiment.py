@@ -120,7 +120,7 @@ def design(
     name = _common(able)
     # Where no input is played for all of them, the pair that is hardest decides.
     hardest = min(able, key=lambda t: t.table[name].value if name else max(s.value for s in t.table.values()))
-    return _experiment(hardest, name or hardest.best(hardest.table) or "", trials), separable, besides
+    return _experiment(hardest, name or hardest.best(hardest.table) or "", trials, begin), separable, besides
 
 
 def _common(trials: Sequence[_Trial]) -> str | None:
@@ -154,13 +154,19 @@ class _Separation:
     falls: tuple[float, float]
 
     @classmethod
-    def of(cls, u: Array, left: Sequence[Array], pair: Rivalry) -> _Separation:
-        """From what cannot be copied, (W, L, ny), in each direction. Coloured noise counts for less."""
+    def of(cls, u: Array, left: Sequence[Array], own: Sequence[Array], pair: Rivalry) -> _Separation:
+        """From what cannot be copied, (W, L, ny), in each direction, beyond what the copying rival misses of its own log.
+
+        Coloured noise counts for less.
+        """
         whiteness = np.minimum(pair.here.whiteness, pair.there.whiteness)
         if len(whiteness) < left[0].shape[2]:
             whiteness = np.full(left[0].shape[2], whiteness.min())
-        falls = [float(np.sum(r**2, axis=(0, 1)) @ whiteness) for r in left]
-        rms = [float(np.sqrt(np.mean(r**2))) for r in left]
+        beyond = [
+            np.maximum(np.sum(r**2, axis=(0, 1)) - np.sum(o**2, axis=(0, 1)), 0.0) for r, o in zip(left, own, strict=True)
+        ]
+        falls = [float(rest @ whiteness) for rest in beyond]
+        rms = [math.sqrt(float(rest.sum()) / r.size) for rest, r in zip(beyond, left, strict=True)]
         return cls(u, (rms[0], rms[1]), (falls[0], falls[1]))
 
     @property
@@ -198,17 +204,19 @@ class _Trial:
         self.table: dict[str, _Separation] = {}
         self._full: set[str] = set()
         for name, u in inputs.items():
-            if (found := self._looked(u, [p.log(u) for p in self.plays])) is not None:
+            if (found := self._looked(u, self.plays)) is not None:
                 self.table[name] = found
         # What looks best to first order may be less by full fits: until the best is one that has been judged so.
         for _ in range(THRESHOLDS.most_judged):
             self.judge([n for n in [self.best(self.table)] if n is not None])
 
-    def _looked(self, u: Array, logs: Sequence[Dataset | None]) -> _Separation | None:
+    def _looked(self, u: Array, plays: Sequence[_Plays]) -> _Separation | None:
         """To first order."""
-        turns = zip((self.pair.there, self.pair.here), logs, strict=True)
+        turns = zip((self.pair.there, self.pair.here), [p.log(u) for p in plays], strict=True)
         both = [_first_order(b, log.windows(self.length)) for b, log in turns if log]
-        return _Separation.of(u, both, self.pair) if len(both) == 2 else None
+        if len(both) < 2:
+            return None
+        return _Separation.of(u, both, [p.own(u, self.length) for p in reversed(plays)], self.pair)
 
     def besides(self, beyond: Sequence[Array]) -> str:
         """What would separate a pair that no input does: an output of the model that is not measured, inputs beyond the limits,
@@ -237,7 +245,7 @@ class _Trial:
         return ""
 
     def _settles(self, u: Array, plays: Sequence[_Plays]) -> bool:
-        found = self._looked(u, [p.log(u) for p in plays])
+        found = self._looked(u, plays)
         return found is not None and found.expected > THRESHOLDS.settled_fall
 
     def judge(self, names: Sequence[str]) -> None:
@@ -249,7 +257,8 @@ class _Trial:
                 _copied(rival, self.measured, play.log(u), self.length)
                 for play, (_, rival) in zip(self.plays, turns, strict=True)
             ]
-            self.table[name] = _Separation.of(u, both, pair)
+            own = [p.own(u, self.length) for p in reversed(self.plays)]
+            self.table[name] = _Separation.of(u, both, own, pair)
             self._full.add(name)
 
     def best(self, names: Iterable[str]) -> str | None:
@@ -312,8 +321,17 @@ class _Plays:
     """
 
     def __init__(self, fitted: Fit, measured: Dataset, begin: Array, held: Array) -> None:
-        self.fitted, self.measured, self.begin, self.held = fitted, measured, begin, held
-        self._hidden = _memory(fitted, begin[None], held[None], measured)
+        self.fitted, self.measured, self.held = fitted, measured, held
+        self._hidden, self.begin = _memory(fitted, begin[None], held[None], measured), begin
+        # A sensor that is off shows another state: what it shows is where the experiment begins.
+        states = [s.name for s in fitted.hypothesis.model.states]
+        shown = [(i, states.index(c.name)) for i, c in enumerate(measured.channels) if c.name in states]
+        rows, columns = np.array(shown, dtype=int).reshape(-1, 2).T
+        off = begin[columns] - self.outputs(held[None, None])[0, 0, rows]
+        self.begin = begin.copy()
+        self.begin[columns] += off
+        if not (np.abs(begin[columns] - self.outputs(held[None, None])[0, 0, rows]) <= np.abs(off)).all():
+            self.begin = begin
         self._logs: dict[int, tuple[Array, Dataset | None]] = {}
 
     def showing(self, column: int) -> _Plays:
@@ -364,8 +382,17 @@ class _Plays:
         own = np.std(y, axis=0)[known:]
         floor, spread = np.append(m.sigma, THRESHOLDS.further_noise * own), np.append(m.spread, own)
         back = np.argsort(order)
+        states = (self.states(u[None])[0],) if len(found.times) == 1 and len(found.times[0]) == len(u) else found.states
         # An experiment is played sample by sample, whatever the recording was.
-        return replace(found, sigma=floor[back], spread=spread[back], hold="zero")
+        return replace(found, sigma=floor[back], spread=spread[back], hold="zero", states=states)
+
+    def own(self, u: Array, length: int) -> Array:
+        """What its own windows (W, L, ny) miss of its log from the true starts: what is late is not known where they begin."""
+        log, f = self.log(u), self.fitted
+        assert log is not None
+        windows = log.windows(length)
+        y = f.hypothesis.simulate(windows, f.theta[None], windows.start[None])
+        return np.nan_to_num(difference(log.channels, y, windows.y[None])[0] / log.sigma * windows.weight)
 
 
 def _speed(y: Array, measured: Dataset) -> Array:
@@ -393,15 +420,15 @@ def _within(plays: Sequence[_Plays], signals: Mapping[str, Array], limits: Limit
     room = THRESHOLDS.experiment_room * (high - low)
     held = plays[0].held
     begin = [p.outputs(held[None, None])[0, 0] for p in plays]
-    low, high = np.min([low + room, *begin], axis=0), np.max([high - room, *begin], axis=0)
+    lowest, highest = (np.array([f(end, b) for b in begin]) for f, end in ((np.minimum, low + room), (np.maximum, high - room)))
     fastest = recorded_speed([p.fitted for p in plays], measured) * [limits.wider.get(n, 1.0) for n in names] * measured.period
 
     def inside(u: Array) -> Array:
         """How many samples of each of u (n, T, nu) can be played."""
         good = np.ones(u.shape[:2], dtype=bool)
-        for p in plays:
+        for p, least_y, most_y in zip(plays, lowest, highest, strict=True):
             y = p.outputs(u)
-            good &= ((y >= low) & (y <= high)).all(axis=2)
+            good &= ((y >= least_y) & (y <= most_y)).all(axis=2)
             good[:, 1:] &= (np.abs(np.diff(y, axis=1)) <= fastest).all(axis=2)
         return np.asarray(np.cumprod(good, axis=1).sum(axis=1))
 
@@ -466,7 +493,7 @@ def joined(first: Dataset, second: Dataset) -> Dataset:
     return replace(first, **both, drives=drives, source=source)
 
 
-def _experiment(trial: _Trial, name: str, trials: Sequence[_Trial]) -> Experiment:
+def _experiment(trial: _Trial, name: str, trials: Sequence[_Trial], begin: Array) -> Experiment:
     pair, table, measured, model = trial.pair, trial.table, trial.measured, trial.pair.here.hypothesis.model
     for other in trials:
         other.judge([name] if name in other.table else [])
@@ -492,8 +519,8 @@ def _experiment(trial: _Trial, name: str, trials: Sequence[_Trial]) -> Experimen
         f"their predictions then differ by {chosen.told:.2g} times the noise, by {math.sqrt(chosen.expected):.2g} sigma in all"
     )
     others = {n: s.told for n, s in table.items() if n != name}
-    begin = [*trial.plays[0].begin.tolist(), *trial.plays[0].held.tolist()]
-    start = {s.name: (v, s.unit) for s, v in zip((*model.states, *model.inputs), begin, strict=True)}
+    values = [*begin.tolist(), *trial.plays[0].held.tolist()]
+    start = {s.name: (v, s.unit) for s, v in zip((*model.states, *model.inputs), values, strict=True)}
     predicted = {s.name: moved[..., i] for i, s in enumerate(measured.channels)}
     rivals, window = (pair.named, pair.other), trial.length * measured.period
     return Experiment(rivals, name, sentence, t, inputs, chosen.told, others, travel, apart, start, predicted, window)

@@ -119,9 +119,10 @@ def test_what_no_input_separates_has_no_experiment():
     assert design([Rivalry(*SAME, *fits)], measured, nothing_to_play, 120) == (None, (False,), {})
 
 
-def test_late_inputs_and_a_late_sensor_are_one_to_every_input():
-    """What is promised is what comes: the sensor's delay is in what its rival has to copy."""
-    log = swing(0.3 * np.sin(2 * np.pi * 0.5 * T) + 0.2 * np.sin(2 * np.pi * 1.3 * T), {"delay": 0.04}, 4)
+@pytest.mark.parametrize("delay", [0.04, 0.15])
+def test_late_inputs_and_a_late_sensor_are_one_to_every_input(delay):
+    """What is promised is what comes: a late sensor is in what its rival has to copy, and what no fit knows does not count."""
+    log = swing(0.3 * np.sin(2 * np.pi * 0.5 * T) + 0.2 * np.sin(2 * np.pi * 1.3 * T), {"delay": delay}, 4)
     keys = [("input-delay", "u"), ("sensor-delay", "q")]
     model, measured, fits = rivals(log, keys)
     assert abs(better(*fits)) < 10

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from exams import plain, store
+from exams import plain, play, score, store
 from exams.hidden.laws import Hidden
 from exams.hidden.plain import NAMES, RUN, plant
 
@@ -147,3 +147,36 @@ def test_answers_keep_the_commit(tmp_path, capsys):
     kept = tmp_path / "answers.jsonl"
     kept.write_text('{"part": "plain", "seed": 1, "index": 0, "commit": "abc"}\n')
     assert [r["commit"] for r in store.sittings(print, [("plain", 1, 0, 1.0)], 1, kept)] == ["abc"]
+
+
+def test_a_doubtful_case_is_played_on_from_a_start_under_a_held_input():
+    case = plain.doubtful("t", 1, 0)
+    assert case.label == "clear"
+    assert case.rig.excitation in plain.POOR
+    start, u = 0.5 * case.rig.play(case.hidden)[0].mean(axis=0), np.full((50, 1), 0.3 * case.rig.u.max())
+    second = case.given(u, start, float(u[0, 0]), 10)
+    x, _, played = second.rig.play(second.hidden)
+    assert np.array_equal(x[0], start)
+    assert np.array_equal(played, u[:, 0])
+    assert np.allclose(second.rig.noise.std(axis=0), case.rig.noise.std(axis=0), rtol=0.5)
+    assert not np.array_equal(second.rig.noise, case.given(u, start, 0.0, 11).rig.noise)
+
+
+def test_an_experiment_has_resolved_what_it_promised_to_and_no_more():
+    named = {"verdict": "causes", "causes": [{"effect": "a", "site": "q"}], "ambiguous_with": [[["c", "q"]]]}
+    asked = {"hidden": [{"effect": "a", "site": "q"}], "members": [["a", "q"], ["b", "q"], ["c", "q"]], "designed": named}
+    asked["apart"] = [{"rival": ["b", "q"]}]
+    assert score.open_question(asked)
+    assert not score.open_question(asked | {"apart": []})
+    assert score.resolved(asked)
+    assert not score.resolved(asked | {"apart": [{"rival": ["b", "q"]}, {"rival": ["c", "q"]}]})
+    assert not score.resolved(asked | {"hidden": [{"effect": "b", "site": "q"}]})
+
+
+@pytest.mark.exam
+def test_what_is_promised_of_an_experiment_is_found_when_it_is_played():
+    r = play.experiment(2002, 1, 120.0)
+    assert score.open_question(r)
+    assert score.resolved(r)
+    assert r["beyond"] < 0.02
+    assert all(p["found"] == pytest.approx(p["promised"], rel=0.3) for p in r["apart"])

@@ -221,7 +221,7 @@ def sized(made: Rig, noise: log.Noise, key: tuple[str, str], drawn: Shape, targe
     return size, found
 
 
-def doubtful(part: str, seed: int, index: int, systems: Sequence[str] = ("pendulum", "drive", "cartpole")) -> Case:
+def doubtful(part: str, seed: int, index: int, systems: Sequence[str] = ("pendulum", "drive")) -> Case:
     """One effect in a noisy log of one sine, where several effects may look alike."""
     rng = generator(part, seed, index)
     names = [e for e in NAMES if e != "sensor-quantisation" and any(sites(PLANTS[p], e) for p in systems)]
