@@ -102,7 +102,8 @@ def _beyond(model: gc.Model, log: gc.Recording, given: Mapping[str, Any], quiet:
 
 def _apart(model: gc.Model, log: gc.Recording, quiet: gc.Trajectory, truth: Key, found: gc.Diagnosis) -> list[Record]:
     """Of every pair with the truth: what was promised, and what its rival leaves of the log without noise in a joint fit."""
-    both, design = gc.Recording((*log.trajectories, replace(quiet, name="experiment")), hold=log.hold), found.design
+    second, design = gc.Recording((replace(quiet, name="experiment"),)).split({"last": 0.25})[0], found.design
+    both = gc.Recording((*log.trajectories, *second.trajectories), hold=log.hold)
     alone, out = Dataset.of(model, log), []
     measured = replace(Dataset.of(model, both), sigma=alone.sigma, spread=alone.spread)
     if design is None or design.window is None or len(found.causes) > 1:

@@ -103,7 +103,10 @@ def design(
     fits = list({id(f): f for pair in pairs for f in (pair.here, pair.there)}.values())
     begin, held = _rest(fits, measured, limits)
     plays = {id(f): _Plays(f, measured, begin, held) for f in fits}
-    allowed = _within(list(plays.values()), shapes(limits.inputs, limits.seconds, measured, seed, held), limits, 2 * length)
+    part = THRESHOLDS.experiment_fitted
+    few, many = (math.ceil((n * length + measured.history) / part) + 1 for n in (1, THRESHOLDS.experiment_windows))
+    least = max(few, 2 * length, min(many, measured.samples(limits.seconds)))
+    allowed = _within(list(plays.values()), shapes(limits.inputs, limits.seconds, measured, seed, held), limits, least)
     trials = [_Trial(pair, allowed, plays, length) for pair in pairs]
     best = [t.best(t.table) for t in trials]
     separable = tuple(
@@ -365,12 +368,14 @@ class _Plays:
             return between(y[None], ahead)[0] if late.any() else y
 
     def log(self, u: Array) -> Dataset | None:
-        """What would be recorded; None where nothing moves."""
+        """What would be recorded and fitted; None where nothing moves."""
         if id(u) not in self._logs:
             self._logs[id(u)] = u, self._log(u)
         return self._logs[id(u)][1]
 
     def _log(self, u: Array) -> Dataset | None:
+        # The rest will be held out of the fit.
+        u = u[: int(THRESHOLDS.experiment_fitted * len(u))]
         m, model, y = self.measured, self.fitted.hypothesis.model, self.outputs(u[None])[0]
         known = len(m.spread)
         if not np.isfinite(y).all() or (np.ptp(y, axis=0)[:known] < 1e-9 * m.spread).any() or not np.ptp(y, axis=0).all():
@@ -392,7 +397,7 @@ class _Plays:
         assert log is not None
         windows = log.windows(length)
         y = f.hypothesis.simulate(windows, f.theta[None], windows.start[None])
-        return np.nan_to_num(difference(log.channels, y, windows.y[None])[0] / log.sigma * windows.weight)
+        return np.asarray(np.nan_to_num(difference(log.channels, y, windows.y[None])[0] / log.sigma * windows.weight))
 
 
 def _speed(y: Array, measured: Dataset) -> Array:
@@ -443,7 +448,7 @@ def _within(plays: Sequence[_Plays], signals: Mapping[str, Array], limits: Limit
             # It may not end at full speed near an end: back to what is held, for so long that this is seen.
             back = math.ceil(THRESHOLDS.experiment_tail * len(row))
             kept = min(kept, len(row) - back)
-            cuts = [k for k in (int(kept * part) for part in THRESHOLDS.experiment_cuts) if k >= least]
+            cuts = [k for k in (int(kept * part) for part in THRESHOLDS.experiment_cuts) if k + back >= least]
             if not cuts or size * (kept + back) <= worth.get(n, 0.0):
                 continue
             fall = np.maximum(1 - 2 * np.arange(back) / back, 0.0)[:, None]
