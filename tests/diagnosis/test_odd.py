@@ -7,6 +7,7 @@ import gapcert as gc
 from gapcert.plugin import Recording, Trajectory
 from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.data.feedback import loops
+from gapcert_diagnosis.figure import _Axis, _carried
 from gapcert_diagnosis.testing import equations
 
 OVEN = {
@@ -92,3 +93,10 @@ def test_a_parameter_where_nothing_has_a_coordinate_is_drawn_at_an_input():
     assert [(c.effect, c.site) for c in found.causes] == [("parameter", "b")]
     assert found.warnings == ()
     assert found.figure.laws
+
+
+def test_nothing_carries_a_law_that_runs_away():
+    axis = _Axis("x", "m", np.linspace(0, 1, 60).reshape(2, 30))
+    assert _carried(axis.values**2, axis) > 0.9
+    for wild in (np.nan, np.inf, 1e200):
+        assert _carried(np.where(axis.values > 0.5, wild, axis.values), axis) == 0.0
