@@ -265,6 +265,8 @@ def _means(values: Array, member: _Members, count: int) -> Array:
 def _carried(law: Array, axis: _Axis) -> float:
     """The share of a law's variance along the path that is a function of one quantity."""
     member = _intervals(axis.values, 2 * THRESHOLDS.quantity_intervals)
+    if not (np.abs(law) < THRESHOLDS.wildest_residual).all():
+        return 0.0  # nothing carries a law that runs away
     spread = float(np.var(law))
     if spread <= 1e-12 * float(np.mean(law**2)):
         return 1.0
@@ -347,7 +349,7 @@ def _place(path: _Fitted, c: Candidate) -> _Place | None:
 
 
 def _law(path: _Fitted, place: _Place, group: Causes, axis: _Axis, law: Array) -> Law:
-    timed = axis.name == "time"
+    timed, law = axis.name == "time", np.where(np.isfinite(law), law, np.nan)  # what runs away is not drawn
     remembers = any(_remembers(path.library.extension(c)) for c in group)
     shape = "line" if timed or _carried(law, axis) >= THRESHOLDS.carrying_share else "loop" if remembers else "cloud"
     # What happens once is looked at where it happens.
@@ -364,7 +366,7 @@ def _law(path: _Fitted, place: _Place, group: Causes, axis: _Axis, law: Array) -
     x, y = _means(axis.values, member, len(label)), _means(law, member, len(label)) + further
     at, line = (np.empty(0), np.empty(0)) if not group else _drawn(shape, axis.values[rows], law[rows])
     reach = max(3 * float(np.median(half)), THRESHOLDS.wide_interval * float(np.ptp(law)) if group else 0.0)
-    keep = (half <= reach) & (label < 2 * THRESHOLDS.quantity_intervals)
+    keep = (half <= reach) & (label < 2 * THRESHOLDS.quantity_intervals) & np.isfinite(x) & np.isfinite(y)
     names = " and ".join(called(*c.told).removesuffix(f" at {place.site}") for c in group)
     title = f"{names or 'what is left'} at {place.site}"
     up = (label[keep] >= THRESHOLDS.quantity_intervals).astype(np.float64) if shape == "loop" else np.empty(0)

@@ -93,6 +93,7 @@ class Thresholds:
     relay_cutoff: float = chosen(1e-3, "relative singular value of states: sums that move less are noise")
     # fitting
     blown_residual: float = chosen(1e6, "noise floors that a simulation which blew up is charged with, per sample")
+    unlike_motion: float = chosen(2.0, "deviations of the motion: those that have nothing in common differ by 1.4")
     wildest_residual: float = threshold(1e100, "noise floors: beyond 1e154 a square is no float64; it has blown up long before")
     small_fall: float = chosen(0.3, "of Σ r²: what another descent from elsewhere has to promise")
     step_fall: float = chosen(0.01, "of Σ r²: no step is made for less, far below what decides between causes")

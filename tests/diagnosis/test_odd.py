@@ -1,5 +1,7 @@
 """Odd logs and specs: an answer or one sentence, and no number that is none."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,11 @@ import gapcert as gc
 from gapcert.plugin import Recording, Trajectory
 from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.data.feedback import loops
+from gapcert_diagnosis.figure import _Axis, _carried
+from gapcert_diagnosis.fitting.fit import fit
+from gapcert_diagnosis.fitting.hypothesis import Hypothesis
+from gapcert_diagnosis.fitting.rollout_error import Stretches
+from gapcert_diagnosis.residual.adequacy import close
 from gapcert_diagnosis.testing import equations
 
 OVEN = {
@@ -92,3 +99,30 @@ def test_a_parameter_where_nothing_has_a_coordinate_is_drawn_at_an_input():
     assert [(c.effect, c.site) for c in found.causes] == [("parameter", "b")]
     assert found.warnings == ()
     assert found.figure.laws
+
+
+def test_nothing_carries_a_law_that_runs_away():
+    axis = _Axis("x", "m", np.linspace(0, 1, 60).reshape(2, 30))
+    assert _carried(axis.values**2, axis) > 0.9
+    for wild in (np.nan, np.inf, 1e200):
+        assert _carried(np.where(axis.values > 0.5, wild, axis.values), axis) == 0.0
+
+
+def test_a_simulation_that_runs_away_is_excused_by_no_noise():
+    """Its rollouts, moved by noise, run away as far: that says nothing for it."""
+    rng, x, y = np.random.default_rng(2), 0.5, []
+    for _ in range(600):
+        y.append(x + 1e-3 * rng.standard_normal())
+        x += 0.02 * (np.sin(len(y) / 40) - x)
+    away = {"kind": "equations", "states": {"x": "1"}, "derivative": {"x": "(k*x**3 - x)/T"}, "period": "20 ms"}
+    model = equations(away | {"parameters": {"k": 2, "T": "1 s"}})
+    recording = Recording((Trajectory(0.02 * np.arange(600), {"x": np.array(y)}, "log"),))
+    measured = Dataset.of(model, recording)
+    windows = measured.windows(40)
+    fitted = fit(Hypothesis(model), windows)
+    judge = Stretches.of(measured, 4.0)
+    assert np.isfinite(judge.floors(fitted)).all()
+    assert all(np.isfinite(list(vars(g).values())).all() for g in judge.gains(fitted, fitted, 0).values())
+    quiet = replace(fitted, residual=0.1 * fitted.residual / np.sqrt(fitted.chi))
+    assert judge.error(fitted) > 2
+    assert not close(judge, quiet, 0)

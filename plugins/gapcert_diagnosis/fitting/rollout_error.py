@@ -75,9 +75,8 @@ class Stretches:
     def squares(self, fitted: Fit) -> Array:
         """Mean squared error (W, ny) of every rollout and channel."""
         error = difference(self.windows.measured.channels, self.simulate(fitted), self.windows.y[:, self.lead :])
-        seen = self.windows.weight[:, self.lead :]
-        with np.errstate(over="ignore"):
-            return np.asarray(np.sum(seen * error**2, axis=1) / np.maximum(np.sum(seen, axis=1), 1))
+        most, seen = THRESHOLDS.blown_residual * self.windows.measured.spread, self.windows.weight[:, self.lead :]
+        return np.asarray(np.sum(seen * np.clip(error, -most, most) ** 2, axis=1) / np.maximum(np.sum(seen, axis=1), 1))
 
     def blocks(self, fitted: Fit) -> Array:
         """E² of stretches that share no data, or of the rollouts, where there is one such stretch."""

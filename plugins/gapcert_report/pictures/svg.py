@@ -132,7 +132,7 @@ def _variables(text: str) -> str:
 
 def scaled(unit: str, *values: Array) -> tuple[float, str]:
     """A power of ten that brings the largest value near 1, and the unit with it: (1e-5, "10⁻⁵ rad")."""
-    top = max((float(np.nanmax(np.abs(v))) for v in values if v.size), default=0.0)
+    top = max((float(np.abs(v[np.isfinite(v)]).max(initial=0.0)) for v in values), default=0.0)
     exponent = int(np.floor(np.log10(top))) if top > 0 else 0
     if -2 <= exponent <= 3:
         return 1.0, unit
