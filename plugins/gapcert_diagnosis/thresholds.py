@@ -99,6 +99,8 @@ class Thresholds:
     step_fall: float = chosen(0.01, "of Σ r²: no step is made for less, far below what decides between causes")
     rough_step_fall: float = chosen(1e-4, "of Σ r² as a part of it, where a law is plainly missing and its digits mean nothing")
     settling_rounds: int = chosen(8, "of starts, with all numbers held: Gauss-Newton on few unknowns ends before")
+    leaning_rounds: int = chosen(3, "of a descent with memories to first order, before each trial carries its own")
+    leaning_iterations: int = chosen(4, "in each of these rounds: further off, the first order is none")
     retraced_memories: int = decides(3, "times that memories are carried along the fitted motion; each moves them less")
     retraced_iterations: int = decides(3, "at least, after memories were carried again")
     counted_floor: float = decides(0.5, "mean squares below it count as it: a floor that was estimated too large is no merit")

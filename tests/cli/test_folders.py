@@ -116,15 +116,19 @@ def test_a_log_says_what_goes_on_where_nothing_is_told(monkeypatch):
     terminal(Event("progress", "controller", {"done": 1, "total": 4, "unit": "designs", "best": {"domain": "40%"}}))
     clock[0] = 100.0
     terminal(Event("progress", "controller", {"done": 2, "total": 4, "unit": "designs", "best": {"domain": "44%"}}))
-    clock[0] = 112.0
+    for clock[0] in (112.0, 122.0, 133.0):
+        terminal.beat()
+    terminal(Event("progress", "controller", {"done": 3, "total": 4, "unit": "designs", "best": {"domain": "44%"}}))
+    clock[0] = 144.0
     terminal.beat()
     assert log.getvalue().splitlines() == [
         "[  0:00] controller ...",
         "[  0:12] controller: still at it, for 12 s",
         "[  1:11] controller: still at it, for 1 min 11 s",
         "[  1:40] controller: 2 of 4 designs (50%), 29 s per design, 58 s left, so far domain 44%",
-        "[  1:52] controller: still at it, for 1 min 52 s; controller: 2 of 4 designs (50%), 29 s per design, 46 s left, "
-        "so far domain 44%",
+        "[  1:52] controller: still at it, for 1 min 52 s",
+        "[  2:13] controller: still at it, for 2 min 13 s",
+        "[  2:24] controller: 3 of 4 designs (75%), 31 s per design, 20 s left",
     ]
 
 

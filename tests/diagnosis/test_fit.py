@@ -97,6 +97,16 @@ def test_between_samples_a_cubic_is_exact_and_goes_on_beyond_the_ends():
     assert short.ravel().tolist() == [2.0, 4.0]
 
 
+@pytest.mark.parametrize("shape", [(1, 3, 9, 1), (1, 1, 1, 1), (9, 2), (4, 3, 1, 2), (4, 1, 9, 1)])
+def test_signals_of_one_clock_or_of_many_are_looked_up_alike(shape):
+    rng = np.random.default_rng(1)
+    y, ahead = rng.standard_normal((4, 3, 9, 2)), rng.uniform(-2.0, 2.0, shape)
+    each = np.broadcast_to(ahead, y.shape)
+    for i, w, c in np.ndindex(4, 3, 2):
+        alone = between(y[i : i + 1, w : w + 1, :, c : c + 1], each[i : i + 1, w : w + 1, :, c : c + 1])
+        np.testing.assert_array_equal(between(y, ahead)[i, w, :, c], alone[0, 0, :, 0])
+
+
 def test_hidden_states_begin_as_the_history_left_them():
     lag = Extension(
         "lag",

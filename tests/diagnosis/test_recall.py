@@ -8,6 +8,7 @@ import pytest
 import gapcert as gc
 from gapcert.testing import multisine
 from gapcert_diagnosis.data.dataset import Dataset
+from gapcert_diagnosis.fitting.fit import fit
 from gapcert_diagnosis.fitting.hypothesis import Hypothesis, recalled
 from gapcert_diagnosis.search.candidates import Candidate, Library
 from gapcert_diagnosis.testing import CART, equations
@@ -109,3 +110,36 @@ def test_what_is_known_of_the_past_is_not_found_again_and_counts():
     np.testing.assert_allclose(h.simulate(known.take(half), theta, starts[:, half]), whole[:, half], atol=1e-12)
     forgotten = replace(known, memory=np.zeros_like(known.memory))
     assert np.abs(h.simulate(forgotten, theta, starts) - whole).max() > 1e-3
+
+
+def test_memories_lean_with_the_numbers_as_differences_of_passes_say():
+    extended, values, windows, _ = slow("supply-sag", "u", sag=0.2, time_constant=3.0)
+    names = ("supply_sag_u_sag", "supply_sag_u_time_constant")
+    theta = np.array([values[n] for n in names])
+    h = Hypothesis(extended, names, theta, 0.1 * theta, 10 * theta, 0.05 * theta, np.full(2, np.inf))
+    near, moved = h.leaning(windows, theta), theta * [1.01, 0.98]
+    apart = np.abs(h.hidden(windows, moved[None]) - h.hidden(windows, theta[None])).max()
+    off = np.abs(h.remembering(near, moved).memory - h.hidden(windows, moved[None])).max()
+    assert 0 < off < 0.05 * apart
+    half, starts = np.arange(0, len(windows), 2), np.stack([windows.start] * 2)
+    whole = h.simulate(near, np.stack([theta, moved]), starts)
+    np.testing.assert_allclose(h.simulate(near.take(half), np.stack([theta, moved]), starts[:, half]), whole[:, half])
+    np.testing.assert_allclose(whole[0], h.simulate(windows, theta[None], windows.start[None])[0], atol=1e-12)
+
+
+def test_leaning_memories_end_a_fit_where_whole_passes_do(monkeypatch):
+    extended, values, windows, _ = slow("dahl-friction", "q", level=0.3, displacement=0.05)
+    windows = replace(windows, measured=replace(windows.measured, sigma=1e-3 * windows.measured.spread))
+    names = ("dahl_friction_q_level", "dahl_friction_q_displacement")
+    theta = np.array([values[n] for n in names])
+    h = Hypothesis(extended, names, theta * [1.2, 0.8], 0.1 * theta, 10 * theta, 0.05 * theta, np.full(2, np.inf))
+    passes = []
+    own = Hypothesis.hidden
+    monkeypatch.setattr(Hypothesis, "hidden", lambda h, w, rows: passes.append(len(rows)) or own(h, w, rows))
+    found = fit(h, windows)
+    few, passes[:] = sum(passes), []
+    monkeypatch.setattr("gapcert_diagnosis.fitting.fit._leaning", lambda h, windows, theta: windows)
+    slower = fit(h, windows)
+    assert few < 0.7 * sum(passes)
+    np.testing.assert_allclose(found.theta, slower.theta, atol=0.02 * slower.interval().max())
+    assert found.chi[0] == pytest.approx(slower.chi[0], abs=1e-3)

@@ -29,7 +29,7 @@ class Terminal:
     def __init__(self, stream: TextIO, quiet: bool = False) -> None:
         self.stream, self.quiet = stream, quiet
         self.begin = time.monotonic()
-        self.now, self.last = 0.0, 0.0
+        self.now, self.last, self.wait, self.best = 0.0, 0.0, PAUSE, ""
         self.bars: Bars | None = None
         self.paces: dict[str, Pace] = {}
         self.stages: dict[str, float] = {}
@@ -72,11 +72,10 @@ class Terminal:
         """Where nothing was told for long, what goes on, and since when."""
         with self._lock:
             now = time.monotonic() - self.begin
-            if self.stages and self.bars is None and not self.quiet and now - self.last > PAUSE:
+            if self.stages and self.bars is None and not self.quiet and now - self.last > (PAUSE if self.recent else self.wait):
                 stage, since = next(reversed(self.stages.items()))
-                self.now = now
-                told = "" if self.recent is None else f"; {self._reported(*self.recent)}"
-                self.line(f"{stage}: still at it, for {duration(now - since)}{told}")
+                self.now, self.wait = now, 2 * self.wait
+                self.line(self._reported(*self.recent) if self.recent else f"{stage}: still at it, for {duration(now - since)}")
 
     def _shown(self, event: Event) -> None:
         if event.name == "warning":
@@ -84,7 +83,7 @@ class Terminal:
         elif event.name == "progress":
             self._progress(event.stage, event.data)
         elif event.name == "stage-started":
-            self.stages[event.stage], self.recent = self.now, None
+            self.stages[event.stage], self.recent, self.wait, self.best = self.now, None, PAUSE, ""
             self.line(f"{event.stage} ...")
             if self.bars is not None:
                 self.bars.at(event.stage)
@@ -108,6 +107,8 @@ class Terminal:
             self.line(self._reported(name, data))
 
     def _reported(self, name: str, data: Mapping[str, Any]) -> str:
+        best, self.recent, self.wait = best_so_far(data.get("best")), None, PAUSE
+        data, self.best = data if best != self.best else {**data, "best": None}, best
         return f"{name}: {', '.join(reported(data, self.paces.setdefault(name, Pace()), self.now))}"
 
     def over(self) -> None:

@@ -213,7 +213,8 @@ class Windows:
     """W stretches of L samples: outputs y (W, L, ny), inputs with their history u (W, H + L, nu), guessed states (W, nx).
 
     trajectory (W,): of the recording; weight (W, L, ny) and offset (W, L) as in Dataset; place (W, 2): piece and sample.
-    memory (W, nh): the hidden states of a model where the windows begin, where they are known.
+    memory (W, nh): the hidden states of a model where the windows begin, where they are known: at numbers `about` (W, p), with
+    which they change by `leaning` (W, nh, p).
     """
 
     measured: Dataset
@@ -227,6 +228,8 @@ class Windows:
     offset: Array
     place: Array
     memory: Array | None = None
+    about: Array | None = None
+    leaning: Array | None = None
 
     def __len__(self) -> int:
         return len(self.t)

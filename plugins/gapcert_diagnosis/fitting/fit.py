@@ -115,9 +115,12 @@ def fit(
     Σ r² + max(1, Σ r²/n)·Σ ((θ − θ₀)/sd)²: untempered, a large unknown effect would drag the nuisances away first.
     """
     theta = np.clip(h.value if theta is None else theta, h.low, h.high)
-    here = _linearise(h, windows, theta, windows.start if start is None else start)
+    part = _leaning(h, windows, theta)
+    here = _linearise(h, part, theta, windows.start if start is None else start)
     if not _followable(here.residual):
-        here = _linearise(h, windows, np.clip(h.value, h.low, h.high), windows.start)
+        theta = np.clip(h.value, h.low, h.high)
+        part = _leaning(h, windows, theta)
+        here = _linearise(h, part, theta, windows.start)
         if not _followable(here.residual):
             m = windows.measured
             raise UsageError(
@@ -127,12 +130,12 @@ def fit(
                 "a shorter diagnose.window"
             )
     ends, given = _Ends.of(windows), windows
-    here = _descended(h, windows, here, ends, iterations)
+    here = _led_down(h, windows, part, here, ends, iterations)
     for _ in range(THRESHOLDS.retraced_memories if h.model.remembers else 0):
-        if (again := _retraced(h, windows, here)) is None:
+        if (again := _retraced(h, windows, here, ends)) is None:
             break
-        windows, here = again
-        here = _descended(h, windows, here, ends, max(THRESHOLDS.retraced_iterations, iterations // 2))
+        windows, part, here = again
+        here = _led_down(h, windows, part, here, ends, max(THRESHOLDS.retraced_iterations, iterations // 2))
     temper = max(1.0, float(squares(here.residual).sum()) / ends.n)
     schur = reduced(h, here, temper, np.zeros(1))[0][0]
     size = here.width[: len(theta)]
@@ -155,9 +158,13 @@ def rescued(fitted: Fit) -> Fit:
     start = some.start
     for part in THRESHOLDS.restart_parts:
         head = some.head(max(THRESHOLDS.window_samples, windows.length // part))
-        start = fit(fixed, head, start=start).start
-    starts = fitted.start.copy()
-    starts[lost] = start
+        led = fit(fixed, head, start=start)
+        start = led.start
+    gained, starts = energy[lost] - np.mean(led.residual**2, axis=(1, 2)), fitted.start.copy()
+    whole = float(np.sum(fitted.residual**2))
+    if np.maximum(gained, 0.0).sum() * fitted.residual[0].size <= _Ends.of(windows).enough(whole):
+        return fitted
+    starts[lost[gained > 0]] = start[gained > 0]
     again = fit(fitted.hypothesis, windows, theta=fitted.theta, start=starts)
     return again if np.sum(again.residual**2) + again.prior < np.sum(fitted.residual**2) + fitted.prior else fitted
 
@@ -216,10 +223,35 @@ def stepped(fitted: Fit, others: Sequence[Hypothesis]) -> list[Fit | None]:
     return out
 
 
-def _descended(h: Hypothesis, windows: Windows, here: Slopes, ends: _Ends, iterations: int) -> Slopes:
-    """Common steps and the starts in turn, until neither gains."""
+def _leaning(h: Hypothesis, windows: Windows, theta: Array) -> Windows:
+    # Data of a simulator are hit to rounding, which no first order is.
+    return h.leaning(windows, theta) if h.model.remembers and len(theta) and not windows.measured.exact else windows
+
+
+def _led_down(h: Hypothesis, windows: Windows, part: Windows, here: Slopes, ends: _Ends, iterations: int) -> Slopes:
+    """`_descended`, with memories that follow the numbers to first order, `part`, as far as these foretell the residual."""
+    for k in range(THRESHOLDS.leaning_rounds if part is not windows else 0):
+        first = min(iterations, THRESHOLDS.leaning_iterations)
+        there, unused = _descended(h, part, here, ends, first)
+        iterations -= first - unused
+        r = _residual(h, windows, there.theta[None], there.start[None])[0]
+        left, told, before = (float(np.sum(a**2)) for a in (r, there.residual, here.residual))
+        # Within a difference step the slopes of the memories are those that were found there.
+        settled = k > 0 or (np.abs(there.theta - here.theta) <= h.step).all()
+        if settled and abs(left - told) < float(ends.small(np.array(left))):
+            return there.moved(there.theta, there.start, r)
+        temper = max(1.0, before / ends.n)
+        if not left + temper * float(h.prior(there.theta)) <= before + temper * float(h.prior(here.theta)):
+            break
+        part = h.leaning(windows, there.theta)
+        here = _linearise(h, part, there.theta, there.start, r, there.near(h))
+    return _descended(h, windows, here, ends, iterations)[0]
+
+
+def _descended(h: Hypothesis, windows: Windows, here: Slopes, ends: _Ends, iterations: int) -> tuple[Slopes, int]:
+    """Common steps and the starts in turn, until neither gains; and how many iterations are left."""
     if not len(here.theta):
-        return _settle(h, windows, here, ends, iterations)[0]
+        return _settle(h, windows, here, ends, iterations)[0], 0
     while iterations > 0:
         here, taken = _descend(h, windows, here, ends, iterations)
         iterations -= taken
@@ -227,11 +259,11 @@ def _descended(h: Hypothesis, windows: Windows, here: Slopes, ends: _Ends, itera
         here, gained = _settle(h, windows, here, ends)
         if gained < ends.enough(before):
             break
-    return here
+    return here, iterations
 
 
-def _retraced(h: Hypothesis, windows: Windows, here: Slopes) -> tuple[Windows, Slopes] | None:
-    """With memories carried along the fitted motion; None where that changes nothing.
+def _retraced(h: Hypothesis, windows: Windows, here: Slopes, ends: _Ends) -> tuple[Windows, Windows, Slopes] | None:
+    """(windows, the same near the numbers, slopes), memories carried along the fitted motion; None where little changes.
 
     A bristle knows the last few hundredths of a radian, so noise of that size in its past is an error of its law.
     """
@@ -242,9 +274,11 @@ def _retraced(h: Hypothesis, windows: Windows, here: Slopes) -> tuple[Windows, S
     if not reached.all():
         again = h.led(again, here.theta, here.start, ~reached)
     r = _residual(h, again, here.theta[None], here.start[None])[0]
-    if not np.isfinite(r).all() or abs(np.sum(r**2) - np.sum(here.residual**2)) < THRESHOLDS.small_fall:
+    before = float(np.sum(here.residual**2))
+    if not np.isfinite(r).all() or abs(float(np.sum(r**2)) - before) < ends.enough(before):
         return None
-    return again, _linearise(h, again, here.theta, here.start, r, here.near(h))
+    part = _leaning(h, again, here.theta)
+    return again, part, _linearise(h, part, here.theta, here.start, r, here.near(h))
 
 
 def _descend(h: Hypothesis, windows: Windows, here: Slopes, ends: _Ends, iterations: int) -> tuple[Slopes, int]:
@@ -278,7 +312,7 @@ def _settle(
 ) -> tuple[Slopes, float]:
     """The starts alone, each window on its own: one that sticks or turns would hold up all others in a common step."""
     held, p = h.holding(here.theta), len(here.theta)
-    known = held.remembering(windows, np.empty(0))
+    known = h.remembering(windows, here.theta)
     start, residual, now = here.start.copy(), here.residual.copy(), squares(here.residual)
     before, damping, each = float(now.sum()), np.full(len(now), 1e-3), 1 / len(now)
     open_, slopes = np.arange(len(now)), here.starts()

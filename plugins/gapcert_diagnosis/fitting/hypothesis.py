@@ -68,7 +68,7 @@ class Hypothesis:
             y = (shown if every else shown[:, m.columns]).reshape(b, w, length, -1)
             late = np.broadcast_to(self.model.output_delays(values), (b * w, len(self.model.outputs)))[:, m.columns]
             if late.any() or windows.offset.any():
-                ahead = windows.offset[None, :, :, None] - late.reshape(b, w, 1, -1)
+                ahead = windows.offset[None, :, :, None] - (late.reshape(b, w, 1, -1) if late.any() else 0.0)
                 y = between(y, ahead / m.period)
         return np.asarray(y)
 
@@ -78,15 +78,7 @@ class Hypothesis:
 
     def _begun(self, windows: Windows, theta: Array) -> Array | None:
         """Hidden states (b·W, nh) where the windows begin."""
-        b, w = len(theta), len(windows)
-        hidden = None if windows.memory is None else np.tile(windows.memory, (b, 1))
-        if self.model.hidden and hidden is None:
-            # Rows that differ in their starts alone have one past.
-            given = [tuple(row) for row in theta.tolist()]
-            different = sorted(set(given))
-            hidden = self.hidden(windows, np.array(different)).reshape(len(different), w, -1)
-            hidden = hidden[[different.index(row) for row in given]].reshape(b * w, -1)
-        return hidden
+        return self._remembered(windows, theta) if self.model.hidden else None
 
     def _moved(self, windows: Windows, theta: Array, start: Array, hidden: Array | None, every: int) -> Array:
         w, m = len(windows), windows.measured
@@ -117,9 +109,37 @@ class Hypothesis:
             before = before + (np.linalg.pinv(slope, rcond=THRESHOLDS.history_cutoff) @ miss[..., None])[..., 0]
         return windows.begun(before, rows)
 
+    def _remembered(self, windows: Windows, theta: Array) -> Array:
+        """Hidden states (b·W, nh) at the windows' beginnings, as far as these know them."""
+        b, w = len(theta), len(windows)
+        if windows.memory is None:
+            # Rows that differ in their starts alone have one past.
+            given = [tuple(row) for row in theta.tolist()]
+            different = sorted(set(given))
+            hidden = self.hidden(windows, np.array(different)).reshape(len(different), w, -1)
+            return np.asarray(hidden[[different.index(row) for row in given]].reshape(b * w, -1))
+        if windows.about is None or windows.leaning is None:
+            return np.tile(windows.memory, (b, 1))
+        moved = np.einsum("whp,bwp->bwh", windows.leaning, theta[:, None] - windows.about)
+        return np.asarray((windows.memory + moved).reshape(b * w, -1))
+
     def remembering(self, windows: Windows, theta: Array) -> Windows:
         """Windows for rollouts at one theta (p,) only: what the model remembers where they begin is found once."""
-        return replace(windows, memory=self.hidden(windows, theta[None]) if self.model.hidden else None)
+        memory = self._begun(windows, theta[None])
+        return replace(windows, memory=memory, about=None, leaning=None)
+
+    def leaning(self, windows: Windows, theta: Array) -> Windows:
+        """Windows for rollouts near theta (p,): what the model remembers where they begin follows the numbers to first order.
+
+        A pass through all of a recording takes longer than the rollouts.
+        """
+        width = np.where(theta + self.step > self.high, -self.step, self.step)
+        found = self.hidden(windows, np.concatenate([theta[None], theta + np.diag(width)])).reshape(
+            1 + len(theta), len(windows), -1
+        )
+        slopes = np.moveaxis(found[1:] - found[0], 0, -1) / width
+        about = np.tile(theta, (len(windows), 1))
+        return replace(windows, memory=found[0], about=about, leaning=np.nan_to_num(slopes, posinf=0.0, neginf=0.0))
 
     def hidden(self, windows: Windows, theta: Array) -> Array:
         """Hidden states (b·W, nh) at the windows' beginnings, from motions through the history before them."""
@@ -145,19 +165,23 @@ def nudges(x: Array, share: float = THRESHOLDS.start_nudge) -> Array:
 
 def between(y: Array, ahead: Array) -> Array:
     """Values of signals y (b, W, L, ny) `ahead` samples after each (broadcast to y): cubic through the four nearest."""
-    length = y.shape[2]
+    b, w, length, ny = y.shape
     nodes = min(THRESHOLDS.sample_nodes, length)
-    at = np.arange(length)[:, None] + np.broadcast_to(ahead, y.shape)
+    at = np.arange(length)[None, None, :, None] + ahead
     first = np.clip(np.floor(np.nan_to_num(at)) - (nodes // 2 - 1), 0, length - nodes)
     inside, base = at - first, first.astype(np.int64)
-    out = np.zeros_like(y)
+    # One clock for all motions and channels: these are looked up together, which takes a tenth of the time.
+    alike = at.shape[0] == at.shape[3] == 1
+    signals, shape, ny = (y.reshape(b, -1, ny), (1, w, length, 1), 1) if alike else (y.reshape(1, -1, 1), y.shape, ny)
+    rows = (length * np.arange(shape[0] * w).reshape(-1, w, 1, 1) + base) * ny + np.arange(ny)
+    out = np.zeros_like(signals)
     for j in range(nodes):
-        weight = np.ones_like(y)
+        weight = np.ones_like(inside)
         for k in range(nodes):
             if k != j:
                 weight *= (inside - k) / (j - k)
-        out += weight * np.take_along_axis(y, base + j, axis=2)
-    return out
+        out += signals.take(rows.ravel() + j * ny, axis=1) * np.broadcast_to(weight, shape).reshape(1, -1, 1)
+    return np.asarray(out.reshape(y.shape))
 
 
 def seen(

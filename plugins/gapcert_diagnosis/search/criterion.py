@@ -35,6 +35,7 @@ from scipy.special import ndtr, stdtrit
 from gapcert.plugin import Array
 from gapcert_diagnosis.fitting.fit import Fit
 from gapcert_diagnosis.thresholds import THRESHOLDS
+from gapcert_figures import called
 
 from .candidates import Causes, Library
 
@@ -231,5 +232,5 @@ def without(causes: Causes, others: Causes) -> Causes:
 
 
 def named(causes: Causes) -> str:
-    """`coulomb-friction at q + viscous-friction at q`."""
-    return " + ".join(f"{effect} at {site}" for effect, site in (c.told for c in causes)) or "no cause"
+    """`Coulomb friction at q and viscous friction at q`."""
+    return " and ".join(called(*c.told) for c in causes) or "no cause"

@@ -36,10 +36,15 @@ class FittedSets:
     """
 
     def __init__(
-        self, library: Library, windows: Windows, progress: Callable[..., None] = untold, plain: Fit | None = None
+        self,
+        library: Library,
+        windows: Windows,
+        progress: Callable[..., None] = untold,
+        plain: Fit | None = None,
+        like: FittedSets | None = None,
     ) -> None:
-        """plain: the fit of nothing, where it is known."""
-        self.library, self.windows, self.progress = library, windows, progress
+        """plain: the fit of nothing, where it is known; like: the same on the same windows, with inputs held another way."""
+        self.library, self.windows, self.progress, self.like = library, windows, progress, like
         self.parts = max(1, windows.length // windows.measured.brief(THRESHOLDS.short_fit_window))
         self._fits: dict[Keys, Found] = {}
         self._brief: dict[Keys, Fit] = {}
@@ -77,9 +82,16 @@ class FittedSets:
     def fit(self, causes: Causes, base: Found | None, start: Mapping[str, float] | None = None) -> Fit:
         """On long windows, kept; from `start`, or from `base`, the fit of a set that differs little, and from screening."""
         if keys(causes) not in self._fits:
-            self.progress(named(causes), self._so_far())
-            self.fit_again(causes, base, start)
+            self.progress(f"trying {named(causes)}", self._so_far())
+            if (near := self._alike(causes)) is not None:
+                self._keep(causes, fit(near.hypothesis, self.windows, theta=near.theta, start=near.start))
+            else:
+                self.fit_again(causes, base, start)
         return self._fits[keys(causes)][1]
+
+    def _alike(self, causes: Causes) -> Fit | None:
+        """The fit of the same set where inputs are held another way: half a sample of them moves it little."""
+        return None if self.like is None else self.like.known(causes)
 
     def known(self, causes: Causes) -> Fit | None:
         """The fit of a set, if it was ever made."""
@@ -123,7 +135,7 @@ class FittedSets:
     def fit_shaken(self, causes: Causes, base: Found) -> Fit:
         """The best of a fit and of fresh ones from nearby: sticking puts kinks into the cost, and a fit may catch on one."""
         best, dry = self.fit(causes, base), self.library.dry(causes)
-        for factor in THRESHOLDS.shakes if dry and not noise(best) else ():
+        for factor in THRESHOLDS.shakes if dry and not noise(best) and self._alike(causes) is None else ():
             shaken = {n: v * factor if n in dry else v for n, v in best.values.items()}
             self.fit_again(causes, None, shaken)
         for c in causes:

@@ -211,10 +211,10 @@ def _swapped(sets: FittedSets, found: Found, where: Causes, e: Candidate) -> Opt
     rest = [k for k in found[0] if k not in where]
     at = {k.site: k for k in sets.library.candidates if k.effect.name == e.effect.name}
     at = {site: new for site, new in at.items() if not any(sets.library.related(new, k) for k in rest)}
-    start: dict[str, float] = {}
-    for k in where:
+    new, start = tuple(at.get(k.site, k) if k in where else k for k in found[0]), dict[str, float]()
+    for k in where if sets.known(new) is None else ():
         start |= sets.carry(k, at[k.site], found) if k.site in at else {}
-    return tuple(at.get(k.site, k) if k in where else k for k in found[0]), start
+    return new, start
 
 
 def merges(sets: FittedSets, found: Found) -> list[Option]:

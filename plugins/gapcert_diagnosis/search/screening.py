@@ -20,6 +20,7 @@ from gapcert_diagnosis.data.dataset import Windows, flat, once
 from gapcert_diagnosis.fitting.fit import Fit
 from gapcert_diagnosis.fitting.linearised import Motion, Path, sliding, velocity
 from gapcert_diagnosis.thresholds import THRESHOLDS
+from gapcert_figures import called
 
 from .candidates import Candidate, Causes, Library
 from .gains import GainTable, Promise, Push
@@ -52,7 +53,7 @@ class Screen:
 
     def push(self, c: Candidate) -> Push:
         if c.key not in self._pushes:
-            self.tell(f"screening {c.key[0]} at {c.key[1]}")
+            self.tell(f"screening {called(*c.told)}")
             self._pushes[c.key] = self.pushed(c, _distinct(self.library.starts(c), self.library.amplitude(c)))
         return self._pushes[c.key]
 

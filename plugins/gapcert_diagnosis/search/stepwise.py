@@ -38,16 +38,20 @@ def search_windows(
     again = fit(fitted.hypothesis, other.guard()[0], theta=fitted.theta)
     if better(again, fitted) <= THRESHOLDS.tie_score:
         return first
-    second = _guarded(library, other, progress)
+    second = _guarded(library, other, progress, like=first[0])
     fewer = len(second[1][0]) < len(causes)
     return second if better(second[1][1], fitted) > (-THRESHOLDS.tie_score if fewer else THRESHOLDS.tie_score) else first
 
 
 def _guarded(
-    library: Library, windows: Windows, progress: Callable[..., None], plain: Fit | None = None
+    library: Library,
+    windows: Windows,
+    progress: Callable[..., None],
+    plain: Fit | None = None,
+    like: FittedSets | None = None,
 ) -> tuple[FittedSets, Found]:
     earlier, later = windows.guard()
-    sets = FittedSets(library, earlier, progress, plain)
+    sets = FittedSets(library, earlier, progress, plain, like)
     search = EquationSearch(sets)
     found = drop_unconfirmed(sets, search.select(), later)
     if noise(found[1], THRESHOLDS.sure_errors) and not noise(judge(found[1], later), THRESHOLDS.sure_errors):
