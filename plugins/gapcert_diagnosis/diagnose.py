@@ -31,7 +31,7 @@ from .residual.adequacy import blind, close
 from .residual.pushes import elsewhere, pushes
 from .results import Cause, Diagnosis, Estimate, Misfit, Push, Rival, Verdict
 from .search.alternatives import Answer, answered, completed, decided, flags, unit_slip
-from .search.candidates import Candidate, Library
+from .search.candidates import Candidate, Causes, Library
 from .search.criterion import noise, without
 from .search.engine_settings import Setting, Settled, across
 from .search.visible import smallest
@@ -223,6 +223,9 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
     lap("evidence")
 
     settled, windows = _settled(data, problem)
+    if (quiet := data.quieter(problem, *settled.found)) is not None:
+        data = quiet
+        settled, windows = _settled(data, problem)
     lap("search")
 
     answer, judges = _judged(settled, windows, data.held, problem)
@@ -353,6 +356,17 @@ class Data:
     windows: Windows
     held: Dataset
     assumptions: tuple[str, ...]
+
+    def quieter(self, problem: DiagnosisProblem, causes: Causes, found: Fit) -> Data | None:
+        """With noise floors that a fit shows to be lower, as differences of what jumps are no noise; None where none is."""
+        rows = found.residual.reshape(found.windows.y.shape)
+        model = self.library.extended(causes, found.values)
+        less = self.library.measured.quieter(model, rows, problem.recording.noise)
+        if less is None:
+            return None
+        library = self.library.under(self.library.model, problem.effects, less)
+        held = replace(self.held, sigma=library.measured.sigma)
+        return replace(self, library=library, windows=replace(self.windows, measured=library.measured), held=held)
 
     def calm(self, problem: DiagnosisProblem, pushed: Sequence[Push]) -> Data | None:
         """Between pushes, where these are an effect that may be named, no law of a place, and enough is left between them."""

@@ -162,3 +162,31 @@ def test_what_happens_to_an_input_reaches_the_outputs_it_drives(kind):
     assert cause.effect == kind or {cause.effect, kind} == {"input-delay", "sensor-delay"}
     for name, value in numbers.items():
         assert cause.parameters[name].value == pytest.approx(value, rel=0.03)
+
+
+@pytest.mark.exam
+def test_a_floor_that_jumps_have_raised_falls_once_the_cause_is_known():
+    """A motor's current relaxes within a few samples after each step; only beside a model that fits, what is left is noise."""
+    rng = np.random.default_rng(8)
+    R, L, K, J = 1.0, 0.012, 0.05, 4e-4
+    u = rng.choice([-1, 1], N // 6).repeat(6) * rng.uniform(3, 9, N // 6).repeat(6)
+    step, w, i, rows = H / 40, 0.0, 0.0, []
+    for value in u.tolist():
+        rows.append((w, i))
+        for _ in range(40):
+            w, i = w + step * K * i / J, i + step * (0.8 * value - R * i - K * w) / L
+    w, i = np.array(rows).T
+    data = {
+        "states": {"w": "rad/s", "i": "A"},
+        "inputs": {"u": "V"},
+        "parameters": {"R": "1 ohm", "L": "12 mH", "K": "0.05 N*m/A", "J": "4e-4 kg*m^2"},
+        "derivative": {"w": "K*i/J", "i": "(u - R*i - K*w)/L"},
+    }
+    config = gc.registry().config("model", "equations").model_validate({"kind": "equations", "period": f"{H} s", **data})
+    model = gc.registry().build("model", "equations", config, gc.Context(None))
+    sigma = {"w": 0.01 * w.std(), "i": 0.005 * i.std()}
+    shown = {"w": w + sigma["w"] * rng.normal(size=N), "i": i + sigma["i"] * rng.normal(size=N), "u": u}
+    found = gc.diagnose(model, Recording((Trajectory(T, shown, "log"),), {}, "zero"))
+    assert [c.effect for c in found.causes] == ["input-gain"]
+    for name, misfit in found.residual.items():
+        assert misfit.noise_floor == pytest.approx(sigma[name], rel=0.2)

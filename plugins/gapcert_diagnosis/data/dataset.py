@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeVar, final
 
@@ -101,6 +101,16 @@ class Dataset:
             {"samples": int(sizes.sum()), "period": period, "hold": recording.hold or "undeclared"}
             | {k: v for k, v in vars(log).items() if v or k != "resampled"},
         )
+
+    def quieter(self, model: Model, rows: Array, known: Collection[str]) -> Dataset | None:
+        """With less noise in channels that inputs make jump: what varies in half of a residual (W, L, ny) in noise
+        floors; None where none falls. known: channels whose noise is stated."""
+        least = np.array([scatter(list(r)) for r in rows.transpose(2, 0, 1)])
+        falls = (least > 0) & (least < THRESHOLDS.jumping_floor) & [c.name not in known for c in self.channels]
+        if falls.any():
+            falls &= jumped(model, self.columns, self.states, self.inputs, self.repeat) > self.sigma
+        falls &= ~(self.rough > 0) if self.rough.size else True
+        return replace(self, sigma=np.where(falls, least, 1.0) * self.sigma) if falls.any() and not self.exact else None
 
     @property
     def history(self) -> int:
@@ -392,6 +402,16 @@ def at_once(model: Model, x: Array, u: Array, change: Array, repeat: int) -> Arr
     return np.maximum(np.abs(direct), np.abs(held))
 
 
+def jumped(model: Model, columns: tuple[int, ...], states: Sequence[Array], inputs: Sequence[Array], repeat: int) -> Array:
+    """By how much (ny,) the largest step of an input moves the measured channels within a sample."""
+    few, jumps = slice(None, None, max(1, sum(map(len, inputs)) // THRESHOLDS.jumping_samples)), np.zeros(len(columns))
+    x, u = np.concatenate(states)[few], np.concatenate(inputs)[few]
+    for i, most in enumerate(np.max([np.abs(np.diff(a, axis=0)).max(axis=0, initial=0.0) for a in inputs], axis=0).tolist()):
+        moved = at_once(model, x, u, most * (np.arange(model.nu) == i), repeat)[:, columns]
+        jumps = np.fmax(jumps, moved.max(axis=0))
+    return jumps
+
+
 def _beneath(
     model: Model, columns: tuple[int, ...], kept: Sequence[Piece], states: Sequence[Array], floor: Array, repeat: int
 ) -> Array:
@@ -399,12 +419,8 @@ def _beneath(
 
     Of a channel that shows an input at once, what the model says of that is taken away first.
     """
-    u, found, jumps = [p.means(1, "zero") for p in kept], floor.copy(), np.zeros(len(columns))
-    few = slice(None, None, max(1, sum(map(len, u)) // THRESHOLDS.jumping_samples))
-    at, sent = np.concatenate(states)[few], np.concatenate(u)[few]
-    for i, most in enumerate(np.max([np.abs(np.diff(a, axis=0)).max(axis=0, initial=0.0) for a in u], axis=0).tolist()):
-        moved = at_once(model, at, sent, most * (np.arange(model.nu) == i), repeat)[:, columns]
-        jumps = np.fmax(jumps, moved.max(axis=0))
+    u, found = [p.means(1, "zero") for p in kept], floor.copy()
+    jumps = jumped(model, columns, states, u, repeat)
     shown = [model.output(x, a)[:, columns] for x, a in zip(states, u, strict=True)]
     rows = [np.where(p.weight > 0, p.y, np.nan) for p in kept]
     for c in np.flatnonzero(jumps > floor).tolist():
