@@ -10,7 +10,7 @@ import gapcert as gc
 from gapcert.contracts.plugins.component import Context
 from gapcert_diagnosis.native.candidates import native_candidates
 from gapcert_diagnosis.native.rollouts import ErrorStore, Motions, channels
-from gapcert_diagnosis.native.stepwise import EngineSearch, NativeFit, Surface, descend, design
+from gapcert_diagnosis.native.stepwise import EngineSearch, NativeFit, Surface, descend, design, hopeful
 from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_engines.native_model import NativeModel
 
@@ -353,6 +353,14 @@ def test_a_dip_is_found_where_quadratics_lead_away():
     found, surface = descend(lambda z: np.log(np.abs(z - 0.22) + 1e-3) * np.ones(5), np.zeros(1), [(-5, 5)], 0.25, 2)
     np.testing.assert_allclose(found, 0.22, atol=0.02)
     np.testing.assert_allclose(surface.minimum(), found)
+
+
+@pytest.mark.parametrize(
+    ("mean", "spread", "may"), [(0.004, 0.001, False), (0.01, 0.001, False), (0.01, 0.03, True), (0.03, 0.001, True)]
+)
+def test_what_plainly_gains_too_little_is_not_fitted_to_all(mean, spread, may):
+    gained = mean + spread * np.tile([-1.0, 1.0], 12)
+    assert hopeful(gained) == may
 
 
 def test_a_bound_is_kept():

@@ -21,6 +21,7 @@ from gapcert_diagnosis.search.criterion import agreement
 from gapcert_diagnosis.search.selection import drop, forward
 from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_engines import NativeModel
+from gapcert_figures import spoken
 
 from .candidates import NativeCandidate
 from .rollouts import ErrorStore, Motions, score
@@ -103,9 +104,14 @@ class EngineSearch:
         near = [
             f for f, s in zip(tried[:2], few, strict=False) if f is tried[0] or agreement(s - few[0]) ** 2 < THRESHOLDS.near_z2
         ]
-        before = self.mean(parent.model)
-        hopeful = [f for f in near if before - self.mean(f.model) > THRESHOLDS.contact_hope]
-        full = self.rank([self.fit(f.causes, f, THRESHOLDS.full_rounds) for f in hopeful])
+        before, full = self.scores(parent.model), list[NativeFit]()
+        for f in near:
+            # A fit to all is not made for what plainly gains too little, or is plainly behind the fit before.
+            scores = self.scores(f.model)
+            behind = agreement(scores - self.scores(full[0].model)) if full else 0.0
+            if hopeful(before - scores) and behind < math.sqrt(THRESHOLDS.near_z2):
+                full.append(self.fit(f.causes, f, THRESHOLDS.full_rounds))
+        full = self.rank(full)
         for key in (f.causes[-1].key for f in full[:width]):
             others = [f for f in (*full[1:], *tried) if f.causes[-1].key != key]
             self.rivals |= {key: others[0]} if others else {}
@@ -129,7 +135,7 @@ class EngineSearch:
         found: list[tuple[float, NativeCandidate, float]] = []
         rows: dict[str, tuple[float, ...]] = {}
         for n in (n for n in self.entries if n.key not in {c.key for c in best.causes}):
-            self.tell(f"{n.effect}: {n.label}")
+            self.tell(f"screening {_named((n,))}")
             tried = self._try(best, n, n.values or THRESHOLDS.setting_shifts, self.look)
             rows[n.label] = tuple(s for s, _ in tried)
             if not tried or self._twin(n, rows, before):
@@ -190,7 +196,7 @@ class EngineSearch:
         return once(known, frozenset(c.label for c in causes), lambda: self._fitted(causes, start, rounds, motions))
 
     def _fitted(self, causes: Causes, start: NativeFit, rounds: int, motions: Motions | None) -> NativeFit:
-        self.tell(_named(causes), self._best())
+        self.tell(f"trying {_named(causes)}", self._best())
         free, now = _free(causes), {p.name: p.value for p in start.model.parameters}
         if not free:
             return NativeFit(causes, start.model)
@@ -248,6 +254,12 @@ class EngineSearch:
         return start if rest and all(k.option is not None for k in rest) else self.fit(rest, start, THRESHOLDS.few_rounds)
 
 
+def hopeful(gained: Array) -> bool:
+    """May falls of the score (trajectories,) come to what is worth a name, once numbers are fitted to all of these?"""
+    mean, error = float(gained.mean()), float(np.std(gained, ddof=1)) / math.sqrt(len(gained))
+    return mean > THRESHOLDS.contact_hope and mean + THRESHOLDS.sure_errors * error > THRESHOLDS.contact_fall
+
+
 def _free(causes: Causes) -> list[NativeCandidate]:
     """Those with a number."""
     return [c for c in causes if c.parameter is not None]
@@ -265,7 +277,7 @@ def _tolerated(fitted: NativeFit) -> bool:
 
 
 def _named(causes: Causes) -> str:
-    return " + ".join(f"{c.effect}: {c.label}" for c in causes) or "no cause"
+    return " and ".join(f"{spoken(c.effect)} ({c.label})" for c in causes) or "no cause"
 
 
 @final
