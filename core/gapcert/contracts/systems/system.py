@@ -426,7 +426,8 @@ class Model(System, Extendable, EngineHints):
     ) -> Step:
         """`rollout` within rounding: x (n, T // every + 1, nx) from x0 (n, nx), row i under u[i mod w] of u (w, T, nu).
 
-        w divides n. Override for speed. A row that blows up is not finite from there on, and disturbs no other."""
+        w divides n. Override for speed. A row that blows up is not finite from there on, and disturbs no other.
+        """
         u = np.tile(u, (len(x0) // len(u), 1, 1))
         try:
             result = self.rollout(x0, u, parameters=parameters, hidden=hidden)
@@ -450,9 +451,7 @@ class Model(System, Extendable, EngineHints):
         return Step(out, hidden)
 
     def along(self, x: Array, u: Array, *, parameters: Values | None = None, hidden: Array | None = None) -> Array:
-        """One step from every state of given motions x (n, T, nx) under u (n, T, nu): x⁺ (n, T, nx), hidden state handed on.
-
-        Unlike a rollout, every step starts from the motion that is given. parameters: one per motion."""
+        """One step from every state x (n, T, nx) under u (n, T, nu): x⁺ (n, T, nx), hidden state handed on, parameters (n,)."""
         n, steps, _ = x.shape
         if not self.hidden:
             rows = {k: np.repeat(np.broadcast_to(v, (n,)), steps) for k, v in (parameters or {}).items()} or None
