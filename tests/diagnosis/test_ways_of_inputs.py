@@ -93,6 +93,24 @@ def test_an_oven_may_be_late_by_minutes(name, number):
     assert only(found, name) == {number: pytest.approx(80, rel=0.05)}
 
 
+@pytest.mark.parametrize("name", ["input-lag", "input-rate-limit"])
+def test_a_log_may_begin_at_an_input_that_was_held(name):
+    def rated(u, h):
+        out, reached = np.empty_like(u), u[0]
+        for k, level in enumerate(u):
+            moved = np.clip(level - reached, -0.06 * h, 0.06 * h)
+            out[k], reached = reached + moved / 2, reached + moved
+        return out
+
+    def late(u, h):
+        return rated(u, h) if name == "input-rate-limit" else u[0] + lagged(u - u[0], 90.0, h)
+
+    u = 6 + 5 * commands(600, 30, 12)
+    section, slope, _ = OVEN
+    found = only(told((section, slope, 290 + u[0] / 0.0525), u, late), name)
+    assert list(found.values()) == [pytest.approx(90.0 if name == "input-lag" else 0.06, rel=0.05)]
+
+
 def test_two_lags_are_one_of_second_order():
     found = only(told(VALVE, commands(1500, 25, 2), lambda u, h: lagged(lagged(u, 0.3, h), 0.17, h)), "input-lag")
     assert found == {"time_constant": pytest.approx(0.3, rel=0.1), "second": pytest.approx(0.17, rel=0.15)}

@@ -252,14 +252,19 @@ class FittedSets:
         return {key: share for key, share in shares.items() if share < least[key]}
 
     def matters(self, found: Found) -> bool:
-        """Is every cause larger than what an integrator may leave, or than a stated tolerance? What is not, is noted.
+        """Is every cause larger than what an integrator may leave, or than a stated tolerance? What is not, is noted. Nor does
+        a form of a law matter that does what a simpler one does.
 
         Where almost nothing rubs, a thousandth of the effort may be all that is wrong: then it decides what windows look like,
         or rollouts over the longest horizon.
         """
         small = {key: share for key, share in self.small(found).items() if not self.decides(found, key)}
         self.negligible |= small
-        return not small
+        return not small and not any(self._plainer(c, found[1].values) for c in found[0])
+
+    def _plainer(self, c: Candidate, values: Mapping[str, float]) -> bool:
+        forms = (e for e in self.library.candidates if e.site == c.site and c.effect.contains.get(e.effect.name))
+        return any(self.screen.adds(c, values, e) < THRESHOLDS.least_added for e in forms)
 
     def decides(self, found: Found, key: tuple[str, str]) -> bool:
         rest = self.fit(tuple(c for c in found[0] if c.key != key), found)

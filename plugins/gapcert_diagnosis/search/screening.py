@@ -102,15 +102,15 @@ class Screen:
             moved[..., k : k + some] = np.moveaxis(np.repeat(added, every, axis=2)[:, :, :steps], 0, -1)
         return moved
 
-    def pushed(self, c: Candidate, values: Array) -> Push:
-        """The differences that values (g, p) of a candidate's parameters make along the path."""
+    def pushed(self, c: Candidate, values: Array, like: Candidate | None = None) -> Push:
+        """The differences that values (g, p) of a candidate's parameters make along the path, in the steps of another one."""
         names = self.library.names(c)
         if self.library.loosened(c) is not None:
             return Push(c, values, None, None)
         model = self.library.shared(c)
         if not self._moving(c):
             return Push(c, values, None, self._added(c, values))
-        fine = bool(self.library.suggested(c))
+        fine = bool(self.library.suggested(like or c))
         state = self._moved(model, dict(zip(names, values.T, strict=True)), len(values), fine=fine)
         return Push(c, values, np.ascontiguousarray(state), self._fed(c, values))
 
@@ -124,8 +124,8 @@ class Screen:
         shown = [self.path.output(model, dict(zip(names, row, strict=True))) for row in values.tolist()]
         return np.stack([difference(channels, y, self._shown(model)) for y in shown], axis=-1)
 
-    def push_at(self, c: Candidate, values: Mapping[str, float]) -> Push:
-        return self.pushed(c, np.array([[values[n] for n in self.library.names(c)]]))
+    def push_at(self, c: Candidate, values: Mapping[str, float], like: Candidate | None = None) -> Push:
+        return self.pushed(c, np.array([[values[n] for n in self.library.names(c)]]), like)
 
     def silent(self, c: Candidate, values: Mapping[str, float], before: float) -> bool:
         """Does a cause do nothing in the windows that begin before a time?"""
@@ -153,6 +153,15 @@ class Screen:
             return _most(self._force(c, moved)) / library.scales(c)["force"]
         column, effort = self.once(("felt", c.site), lambda: self._felt(c))
         return _most(moved[..., column]) / float(effort)
+
+    def adds(self, c: Candidate, values: Mapping[str, float], simpler: Candidate) -> float:
+        """What a law does to the state beyond one that it contains, as a share of what it does."""
+        mine, theirs = ({p.name: n for n, p in self.library.parameters(k).items()} for k in (c, simpler))
+        known = {theirs[t]: values[mine[m]] for m, t in c.effect.contains[simpler.effect.name].items()}
+        whole, part = self.push_at(c, values, simpler).state, self.push_at(simpler, known).state
+        if whole is None or part is None:
+            return 1.0
+        return _most(whole - part) / max(_most(whole), 1e-300)
 
     def _force(self, c: Candidate, moved: Array) -> Array:
         """The force at a coordinate that makes one-step differences (W, S, nx)."""

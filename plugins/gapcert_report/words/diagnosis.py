@@ -56,7 +56,7 @@ def plus_minus(value: float, low: float, high: float) -> str:
 def amount(cause: Summary) -> str:
     """A cause's numbers with their units: `0.131 ± 0.004 N·m`, or `plus 158 ± 2 N·s/m and minus 232 ± 3 N·s/m`; of a curve how
     many it has."""
-    if len(cause["parameters"]) > 4:
+    if "at_1" in cause["parameters"]:
         return f"drawn through {len(cause['parameters'])} points"
     parts = []
     for name, p in cause["parameters"].items():
