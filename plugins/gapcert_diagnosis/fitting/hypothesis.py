@@ -347,25 +347,28 @@ class _Past:
 
         A machine that is just switched on, or at an operating point: the first samples tell.
         """
-        (path, u), first = self.way.path, [self.way.measured.times[p][0] for p in self.way.pieces]
+        u, first = self.way.path[1], [self.way.measured.times[p][0] for p in self.way.pieces]
         hidden = _defaults(self.model, self.count, np.array(first))
         if not u[:, 0].any():
             return hidden
-        long = max(len(self.way.measured.driven[p]) for p in self.way.pieces)
-        (x, u), rows, given = (np.repeat(a[:, :1], long, axis=1) for a in (path, u)), self._rows(len(first)), flat(hidden)
-        found = self.model.fast_memories(x, u, [u.shape[1] - 1], rows, given)
-        if found is None:
-            begun = np.tile(np.nan_to_num(x[:, 0]), (self.count, 1))
-            found = self.model.fast_rollout(begun, u, parameters=rows, hidden=given, every=u.shape[1]).hidden
-        assert found is not None
-        settled = found.reshape(hidden.shape)
-        known = np.isfinite(settled) & np.array([s.name != "time" for s in self.model.hidden])
-        settled = np.where(known, settled, hidden)
+        settled, plain = self._settled(u[:, :1], hidden), self._settled(0 * u[:, :1], hidden)
+        # What moves without an input is bent by the motion, which was another one before.
+        settled = np.where(np.isfinite(settled) & (plain == hidden), settled, hidden)
         held = self._missed(settled) < self._missed(hidden)
         return np.where(held[..., None], settled, hidden)
 
+    def _settled(self, u: Array, hidden: Array) -> Array:
+        """What is remembered where the first state, and inputs (pieces, 1, nu), have been held for as long as the log is."""
+        long, path = max(len(self.way.measured.driven[p]) for p in self.way.pieces), self.way.path[0][:, :1]
+        (x, drive), rows, given = (np.repeat(a, long, axis=1) for a in (path, u)), self._rows(len(path)), flat(hidden)
+        found = self.model.fast_memories(x, drive, [long - 1], rows, given)
+        if found is None:
+            begun = np.tile(np.nan_to_num(path[:, 0]), (self.count, 1))
+            found = self.model.fast_rollout(begun, drive, parameters=rows, hidden=given, every=long).hidden
+        return hidden if found is None else found.reshape(hidden.shape)
+
     def _missed(self, hidden: Array) -> Array:
-        """Mean square (count, pieces) by which the first samples are missed from there on, in spreads of the states."""
+        """Squares (count, pieces) by which the first samples are missed from there on, in spreads of the states."""
         m, pieces = self.way.measured, self.way.pieces
         few = min(max(THRESHOLDS.first_samples, m.samples(THRESHOLDS.free_stretch)), *(len(m.states[p]) - 1 for p in pieces))
         seen = np.tile([m.states[p][: few + 1] for p in pieces], (self.count, 1, 1))
@@ -373,7 +376,8 @@ class _Past:
         with np.errstate(all="ignore"):
             moved = self.model.fast_rollout(seen[:, 0], u, parameters=rows, hidden=flat(hidden), every=m.repeat).x
             off = difference(self.model.states, moved, seen) / np.maximum(np.std(np.concatenate(m.states), axis=0), 1e-300)
-        return np.nan_to_num(np.mean(off[..., ~self.way.blind] ** 2, axis=(1, 2)), nan=np.inf).reshape(hidden.shape[:2])
+        missed = np.sum(np.where(self.way.blind, 0.0, off) ** 2, axis=(1, 2))
+        return np.asarray(np.nan_to_num(missed, nan=np.inf).reshape(hidden.shape[:2]))
 
     def _rows(self, pieces: int) -> dict[str, Array | float]:
         return {n: np.repeat(v, pieces) if np.ndim(v) else v for n, v in self.parameters.items()}
