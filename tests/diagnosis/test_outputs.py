@@ -81,6 +81,7 @@ def diagnosed(name, lack, floors, seed, kind="smooth", colour=0.0):
     return gc.diagnose(model, Recording((Trajectory(T, channels, "log"),), {}, "zero"))
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("lack", LACKS)
 @pytest.mark.parametrize(("name", "kind"), [("motor", "steps"), ("strut", "smooth")])
 def test_nothing_is_no_answer_to_what_an_output_shows(name, kind, lack):
@@ -102,6 +103,11 @@ def test_what_is_left_is_told_by_its_kind(lack):
     assert found.unexplained.needs_memory == (lack == "hysteresis")
 
 
+def test_noise_is_nothing():
+    assert diagnosed("strut", None, 0.0, 1, "steps", 0.5).verdict == "nothing"
+
+
+@pytest.mark.exam
 @pytest.mark.parametrize("colour", [0.0, 0.5, 0.9])
 @pytest.mark.parametrize("name", ["motor", "strut"])
 def test_noise_of_any_colour_is_nothing(name, colour):

@@ -150,6 +150,7 @@ def played(u, width):
     return out
 
 
+@pytest.mark.exam
 def test_play_of_an_input_is_hysteresis_and_of_the_only_force_as_well_backlash():
     found = only(told(VALVE, commands(1500, 25, 9), lambda u, h: played(u, 0.12)), "input-hysteresis")
     assert found == {"width": pytest.approx(0.12, rel=0.05)}
@@ -229,6 +230,7 @@ def test_nothing_is_found_where_the_input_arrives_as_it_was_sent():
         assert told(plant, 5 * commands(1200, 40, 5, low), lambda u, h: u).verdict == "nothing"
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(
     ("factor", "units"), [(180 / np.pi, "deg/rad"), (0.001, "1000"), (9.80665, "g"), (2.3, None), (0.1, None)]
 )
