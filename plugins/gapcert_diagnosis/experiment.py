@@ -23,7 +23,9 @@ LIMITS = ("diagnose", "experiment", "limits")  # where a spec says them
 BANDS = {"a slow swing": (0.08, 0.4), "a slow multisine": (0.2, 1.5), "a multisine": (0.3, 4.0),
          "a fast multisine": (3.0, 12.0), "a very fast multisine": (12.0, 30.0)}  # fmt: skip
 BEYOND = ("a slow multisine", "a multisine", "slow steps")  # what is tried where no input within the limits tells
+# Also tried small, and begun gently: where speeds or ends of a range allow no more.
 GENTLE = ("a slow swing", "a multisine", "slow steps", "a creeping ramp")
+# Also tried with their opposites, so that what drifts comes back.
 BACK = ("a slow swing", "a slow multisine", "a multisine", "a fast multisine", "steps", "slow steps", "switching")
 
 

@@ -31,7 +31,7 @@ class Thresholds:
     design_start_iterations: int = chosen(3, "that find starts with all numbers held")
     multisine_lines: int = decides(10, "of a multisine: fewer leave gaps in its band, more make it noise")
     small_input: float = chosen(0.3, "of full size: what dry friction and play need to show")
-    experiment_fitted: float = chosen(0.75, "of an experiment, which is fitted; the rest is held out where nothing is said")
+    experiment_fitted: float = chosen(0.75, "of an experiment is fitted: a spec that says nothing holds out the last quarter")
     experiment_windows: float = chosen(3.0, "of its fit, at least, where it may take so long")
     gentle_rise: float = chosen(0.15, "of an experiment, in which a gentle input grows from nothing")
     starts_tried: int = chosen(60, "of the recording, from one of which an experiment begins")

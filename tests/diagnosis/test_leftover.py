@@ -191,7 +191,10 @@ def test_what_long_rollouts_lose_counts_where_windows_are_nearly_noise():
     found, last = left(recorded(truth("quadratic")))
     quiet = replace(last, residual=1.3 * last.residual / np.sqrt(last.chi.max()))
     before = replace(quiet, residual=1.3 * quiet.residual)
-    close = lambda share: share > 0  # noqa: E731
+
+    def close(share):
+        return share > 0
+
     for rest, verdict in ((0.05, "causes"), (0.5, "unexplained")):
         assert leftover.verdict(1, found, quiet, before, False, False, close, rest) == verdict
     slight = replace(found, share=1e-3)

@@ -133,7 +133,7 @@ def completed(search: FittedSets, answer: Answer, judge: Stretches, seed: int) -
 
 
 def _grown(search: FittedSets, base: Found) -> list[Found]:
-    """A set with each of the moves that promise most beside it."""
+    """The base and one more move, for each of the moves that promise most; all fitted."""
     promised = [s for some in search.promises(base) for s in some[: THRESHOLDS.short_fits]]
     moves = {keys(s.move): s.move for s in promised if not any(search.library.related(c, k) for c in s.move for k in base[0])}
     return [(new, search.fit(new, base)) for new in ((*base[0], *move) for move in moves.values())]
