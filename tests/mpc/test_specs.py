@@ -15,7 +15,7 @@ SPECS = Path(__file__).parents[2] / "specs"
 @pytest.mark.parametrize(
     ("name", "sooner"),
     [
-        ("mecanum_mpc", ["certificate.violation=1e-2"]),
+        ("mecanum_mpc", ["certificate.violation=1e-2", "closed_loop.starts=20"]),
         ("pendulum_adaptive", ["closed_loop.starts=20"]),
         ("pendulum_mpc", ["closed_loop.starts=20"]),
     ],

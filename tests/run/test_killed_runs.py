@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+import sigkill
 
 from gapcert.cli.main import main
 from gapcert.run import journal
@@ -42,10 +43,13 @@ report: {html: false, rerun: false}
 """
 
 
-def gapcert(*arguments):
+COMMAND = "import sigkill, sys; from gapcert.cli.main import main; sys.exit(main(sys.argv[1:]))"
+
+
+def gapcert(*arguments, **environment):
     """A process group of its own, so that a kill takes the workers, too."""
-    command = [sys.executable, "-m", "gapcert", *map(str, arguments)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    command, into = [sys.executable, "-c", COMMAND, *map(str, arguments)], subprocess.PIPE
+    return subprocess.Popen(command, stdout=into, stderr=into, text=True, start_new_session=True, env=sigkill.ENV | environment)
 
 
 def killed(process):
@@ -74,12 +78,14 @@ def bits(folder):
 def test_a_killed_run_is_listed_watched_and_resumed_to_the_same_bits(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("long.yaml").write_text(SPEC)
-    # Two at once: one that is left alone, one that is killed.
-    whole, run = gapcert("run", "long.yaml", "--out", "whole", "-q"), gapcert("run", "long.yaml", "--out", "cut", "-q")
-    until(lambda: list(Path("cut").glob("*/samples/bound-0/chunk-000050.npy")), run)
-    (folder,) = Path("cut").iterdir() if not Path("cut/ledger.json").exists() else Path("cut").glob("long-*")
-    until(lambda: standing(folder).share, run)
-    os.killpg(run.pid, signal.SIGSTOP)  # it is not to be over before it has been looked at
+    # Two at once: one that is left alone, one that halts amid its samples, to be looked at and killed.
+    whole, run = (
+        gapcert("run", "long.yaml", "--out", "whole", "-q"),
+        gapcert("run", "long.yaml", "--out", "cut", "-q", SIGKILL_AFTER="500 1.1 halt"),
+    )
+    assert os.waitid(os.P_PID, run.pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT).si_status == signal.SIGSTOP
+    (folder,) = Path("cut").glob("long-*")
+    assert standing(folder).share
     watched, kept = gapcert("watch", folder, "--json"), gapcert("watch", folder, "--keep")
     seen = json.loads(watched.stdout.readline())
     assert (seen["event"], seen["pid"]) == ("run-started", run.pid)
@@ -119,5 +125,5 @@ def test_a_killed_run_is_listed_watched_and_resumed_to_the_same_bits(tmp_path, c
     first = next(line for line in journal.read(folder / journal.NAME) if line.get("again") is False)
     assert first["pid"] == run.pid
     sampled = [line for line in standing(folder).session if line["event"] == "progress" and line["stage"] == "sampling bound-0"]
-    assert named > 50
+    assert named >= 500
     assert sampled[0]["done"] >= 400 * (named - 1), "what was sampled before is not sampled again"

@@ -1,13 +1,15 @@
 """A process that is killed amid its work, however fast or slow the machine is: `import sigkill` in what a test starts.
 
-SIGKILL_AFTER is "AFTER MOMENT WHOM": once AFTER chunks are recorded the process goes on for a MOMENT (s), but not beyond `MORE`
-further chunks. Then it is killed alone, or with its whole group where WHOM is `all`. Without SIGKILL_AFTER nothing happens.
+SIGKILL_AFTER is "AFTER MOMENT WHOM": once AFTER chunks are recorded the process goes on for a MOMENT (s), but not beyond
+`MORE` further chunks. Then it is killed alone, or with its whole group where WHOM is `all`. A WHOM of `halt` waits for the
+MOMENT, so that what is done is reported, and halts after `MORE` further chunks. Without SIGKILL_AFTER nothing happens.
 """
 
 import os
 import signal
 import subprocess
 import threading
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -27,13 +29,15 @@ def armed(after: str, moment: str, whom: str) -> None:
     def die() -> None:
         if whom == "all":
             os.killpg(0, signal.SIGKILL)
-        os.kill(os.getpid(), signal.SIGKILL)
+        os.kill(os.getpid(), signal.SIGSTOP if whom == "halt" else signal.SIGKILL)
 
     def counted(*given: Any) -> None:
         nonlocal done
         append(*given)
         done += 1
-        if done == int(after):
+        if done == int(after) and whom == "halt":
+            time.sleep(float(moment))
+        elif done == int(after):
             timer = threading.Timer(float(moment), die)
             timer.daemon = True  # it kills no process that has done its work
             timer.start()
