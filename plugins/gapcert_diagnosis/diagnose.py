@@ -25,7 +25,7 @@ from .experiment import Limits, told_apart
 from .figure import figure
 from .fitting.fit import Fit, fit, followed
 from .fitting.rollout_error import Stretches, stretches
-from .fitting.step_size import coarse, settled
+from .fitting.step_size import coarse, paced, quickened, settled
 from .residual import unexplained as leftover
 from .residual.adequacy import blind, close
 from .residual.pushes import elsewhere, pushes
@@ -285,7 +285,7 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
         named,
         _misfits(answer),
         gain,
-        _extended(answer, pushed if calm and len(problem.recording.trajectories) == 1 else ()),
+        _extended(answer, problem.model.period, pushed if calm and len(problem.recording.trajectories) == 1 else ()),
         tuple(ties),
         _experiment(answer, separable, besides),
         rest,
@@ -397,8 +397,11 @@ class Data:
         """UsageError where they are too few, or in other terms."""
         model, (with_past, since) = problem.model, problem.recording.led_up(problem.held_out)
         rough = Dataset.of(model, problem.fitted)
-        model, stepping = settled(model, rough.windows(_length(rough, model, problem.window)))
+        length = _length(rough, model, problem.window)
+        model, stepping = settled(model, rough.windows(length))
         first = rough if not stepping else Dataset.of(model, problem.fitted)
+        if (finer := quickened(model, first.windows(length))) is not model:
+            model, first = finer, Dataset.of(finer, problem.fitted)
         library = Library(model, first, problem.effects, max(problem.horizons), problem.exact)
         fitted = library.measured
         held = replace(Dataset.of(model, with_past), sigma=fitted.sigma, spread=fitted.spread, since=since)
@@ -589,7 +592,8 @@ def _read(answer: Answer, c: Candidate, numbers: Mapping[str, float], judge: Str
     return Cause(*c.told, known, _share(math.sqrt(left), math.sqrt(before)))
 
 
-def _extended(answer: Answer, pushed: Sequence[Push] = ()) -> Model:
+def _extended(answer: Answer, period: float, pushed: Sequence[Push] = ()) -> Model:
+    """With the period of the model that was asked about."""
     library, numbers = answer.library, answer.fit.values
     for _, found in library.seen:
         numbers |= found
@@ -599,7 +603,7 @@ def _extended(answer: Answer, pushed: Sequence[Push] = ()) -> Model:
         e, known = law.extension(p.site, model), (p.sign * p.force, p.t, p.duration)
         own = tuple(replace(n, value=v) for n, v in zip(e.parameters, known, strict=True))
         model = model.extend([replace(e, parameters=own)])
-    return model
+    return model if model.period == period else paced(model, model.period / period)
 
 
 def _negligible(answer: Answer) -> tuple[tuple[str, str, float], ...]:

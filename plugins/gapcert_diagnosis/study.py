@@ -25,7 +25,7 @@ from gapcert_recordings import play
 
 from .artifacts import left_behind
 from .diagnose import diagnose
-from .fitting.step_size import built
+from .fitting.step_size import paced
 from .section import DiagnoseConfig, PlayConfig
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ class DiagnosisStudy(Study):
                 folder=folder,
             )
         if parts > 1:
-            found = replace(found, extended_model=_paced(found.extended_model, 1 / parts))
+            found = replace(found, extended_model=paced(found.extended_model, 1 / parts))
         stages.finished("diagnosis", diagnosis=found, recording=recording, bodies=(seen, *(against or ())[:1]))
         summary: dict[str, Any] = {"sentence": found.sentence(), **found.summary()}
         stages.timings |= {k: v for k, v in summary.pop("timings").items() if k not in stages.timings}
@@ -106,11 +106,6 @@ def _closer(build: Build, model: Model) -> tuple[Build, int]:
             raise build.spec.error("play.every", what, f"set {section}.substeps to a multiple of {parts}")
         changed[section] = config.model_copy(update={"substeps": steps // parts, "period": f"{every!r} s"})
     return replace(build, spec=replace(build.spec, config=replace(c, **changed))), parts
-
-
-def _paced(model: Model, parts: float) -> Model:
-    """The same equations with a period 1/parts as long, in sub-steps as long as before."""
-    return built(model.to_spec() | {"period": f"{model.period / parts!r} s", "substeps": round(model.substeps / parts)})
 
 
 def _played(build: Build, model: Model) -> Recording:

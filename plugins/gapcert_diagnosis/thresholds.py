@@ -129,6 +129,8 @@ class Thresholds:
     still_rollout: float = chosen(
         0.02, "noise floors that half the sub-steps may move a rollout by: 5,000 samples sum it up to 2 of Σ r²"
     )
+    mean_input: float = chosen(0.1, "noise floors that an input's changes within a period may move a rollout by")
+    most_quickened: int = chosen(8, "of such periods in a sample")
     most_substeps: int = chosen(128, "times the stated ones: the time of a search grows with them")
     stated_substeps: int = threshold(10_000, "at most, by the formula: more cannot be stated")
     probing_substeps: int = chosen(1000, "of a stated one, in which a rate is measured: an unstable step would not show it")

@@ -6,7 +6,8 @@ What hidden states remember where the history of a window begins is carried ther
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import final
@@ -59,18 +60,38 @@ class Hypothesis:
         b, (w, length, _), m = len(theta), windows.y.shape, windows.measured
         with np.errstate(all="ignore"):
             hidden, values = self._begun(windows, theta), self._values(theta, w)
+            late = np.broadcast_to(self.model.output_delays(values), (b * w, len(self.model.outputs)))[:, m.columns]
+            ahead = windows.offset[None, :, :, None] - (late.reshape(b, w, 1, -1) if late.any() else 0.0)
+            if ahead.any() and m.hold == "zero" and shows_states(self.model):
+                x = self._moved(windows, theta, start, hidden, every=1)
+                return self._late(windows, x, values, hidden, ahead / m.period)
             x = self._moved(windows, theta, start, hidden, every=m.repeat)
-            if self._shows_states():
+            if shows_states(self.model):
                 shown = x.reshape(b * w * length, -1)
             else:
                 shown = seen(self.model, windows, x, values, hidden).reshape(b * w * length, -1)
             every = m.columns == tuple(range(shown.shape[1]))
             y = (shown if every else shown[:, m.columns]).reshape(b, w, length, -1)
-            late = np.broadcast_to(self.model.output_delays(values), (b * w, len(self.model.outputs)))[:, m.columns]
-            if late.any() or windows.offset.any():
-                ahead = windows.offset[None, :, :, None] - (late.reshape(b, w, 1, -1) if late.any() else 0.0)
+            if ahead.any():
                 y = between(y, ahead / m.period)
         return np.asarray(y)
+
+    def _late(
+        self, windows: Windows, x: Array, values: Mapping[str, Array | float], hidden: Array | None, ahead: Array
+    ) -> Array:
+        """Channels (b, W, L, ny) that show states (b·W, steps + 1, nx) `ahead` samples after each.
+
+        What they showed before a window follows from its start, under the input before that.
+        """
+        w, m, steps = len(windows), windows.measured, x.shape[1] - 1
+        u = windows.drive[:, np.clip(np.arange(-1, steps) + m.past, 0, None)]
+        at = np.arange(windows.length)[:, None] * m.repeat + ahead * m.repeat
+        at = np.broadcast_to(at, (len(x) // w, w, windows.length, len(m.columns))).reshape(len(x), windows.length, -1)
+        begun = np.concatenate([x[:, :1], x[:, :-1]], axis=1)
+        shown = within(
+            self.model, begun, np.tile(u, (len(x) // w, 1, 1)), np.where(at < 0, at, at + 1), m.columns, values, hidden
+        )
+        return shown.reshape(-1, w, *shown.shape[1:])
 
     def motion(self, windows: Windows, theta: Array, start: Array, every: int = 1) -> Array:
         """States (b·W, (L − 1)·repeat // every + 1, nx) at every `every`-th model step."""
@@ -153,9 +174,10 @@ class Hypothesis:
         """Of the parameters, one per row where they are free."""
         return {**self.fixed, **{n: np.repeat(theta[:, i], w) for i, n in enumerate(self.names)}}
 
-    def _shows_states(self) -> bool:
-        x = np.zeros((1, self.model.nx))
-        return self.model.output(x, np.zeros((1, self.model.nu))) is x
+
+def shows_states(model: Model) -> bool:
+    x = np.zeros((1, model.nx))
+    return model.output(x, np.zeros((1, model.nu))) is x
 
 
 def nudges(x: Array, share: float = THRESHOLDS.start_nudge) -> Array:
@@ -175,13 +197,40 @@ def between(y: Array, ahead: Array) -> Array:
     signals, shape, ny = (y.reshape(b, -1, ny), (1, w, length, 1), 1) if alike else (y.reshape(1, -1, 1), y.shape, ny)
     rows = (length * np.arange(shape[0] * w).reshape(-1, w, 1, 1) + base) * ny + np.arange(ny)
     out = np.zeros_like(signals)
-    for j in range(nodes):
-        weight = np.ones_like(inside)
-        for k in range(nodes):
-            if k != j:
-                weight *= (inside - k) / (j - k)
+    for j, weight in enumerate(_weights(inside, nodes)):
         out += signals.take(rows.ravel() + j * ny, axis=1) * np.broadcast_to(weight, shape).reshape(1, -1, 1)
     return np.asarray(out.reshape(y.shape))
+
+
+def _weights(at: Array, nodes: int = THRESHOLDS.sample_nodes) -> Iterator[Array]:
+    """Of the values at 0, 1, … that a polynomial goes through, its value `at`."""
+    for j in range(nodes):
+        yield np.asarray(math.prod((at - k) / (j - k) for k in range(nodes) if k != j))
+
+
+def within(
+    model: Model,
+    x: Array,
+    u: Array,
+    at: Array,
+    columns: Sequence[int],
+    values: Mapping[str, Array | float] | None,
+    hidden: Array | None,
+) -> Array:
+    """States (n, K, ny), those of `columns`, at times `at` (n, K, ny) in steps, each cubic as the input of its step moves them.
+
+    x (n, S, nx), u (n, S, nu): where a step begins, and its input. A held input bends a motion where it changes: no polynomial
+    goes across.
+    """
+    nodes = [x]
+    for _ in range(THRESHOLDS.sample_nodes - 1):
+        nodes.append(model.along(nodes[-1], u, parameters=values, hidden=hidden))
+    first = np.clip(np.floor(np.nan_to_num(at)), 0, x.shape[1] - 1)
+    rows = np.arange(len(x))[:, None, None], first.astype(np.int64), np.array(columns)
+    out = np.zeros(at.shape)
+    for weight, node in zip(_weights(at - first), nodes, strict=True):
+        out += weight * node[rows]
+    return out
 
 
 def seen(

@@ -19,7 +19,7 @@ from gapcert_diagnosis.data.dataset import Windows, flat, once
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .fit import Fit
-from .hypothesis import nudges, recalled, seen, shows_memory
+from .hypothesis import nudges, recalled, seen, shows_memory, shows_states, within
 from .step_size import built
 
 
@@ -183,12 +183,27 @@ class Path:
         m, count = self.windows.measured, self.samples.shape[1]
         rows = {n: np.array([v]) for n, v in parameters.items()}
         hidden = recalled(model, self.windows, rows, 1) if shows_memory(model) else None
+        late = model.output_delays(parameters or None) / m.period
+        if late.any() and m.hold == "zero" and shows_states(model):
+            return self._late(model, parameters, moved, late[list(m.columns)])
         y = seen(model, self.windows, self.samples + moved, parameters, hidden, m.history)
-        late, at, out = model.output_delays(parameters or None) / m.period, np.arange(count), y.copy()
+        at, out = np.arange(count), y.copy()
         for c in np.flatnonzero(late).tolist():
             for w in range(len(y)):
                 out[w, :, c] = np.interp(at - late[c], at, y[w, :, c])
         return np.asarray(out[:, m.history :][..., m.columns])
+
+    def _late(self, model: Model, parameters: Mapping[str, float], moved: Array | float, late: Array) -> Array:
+        """Channels that come `late` (ny,) samples: between two samples a motion bends as the model does, and meets both."""
+        m, x = self.windows.measured, [self.samples[:, :-1] + moved]
+        for k in range(m.repeat):
+            x.append(model.along(x[-1], self.u[:, k :: m.repeat], parameters=parameters or None))
+        missed = (self.samples[:, 1:] + moved - x.pop())[..., m.columns]
+        at = np.maximum(np.arange(m.history, self.samples.shape[1])[:, None] - late, 0)
+        piece = np.minimum(at.astype(np.int64), missed.shape[1] - 1)
+        steps, times = np.stack(x, axis=2).reshape(len(self.u), -1, model.nx), np.tile(at * m.repeat, (len(self.u), 1, 1))
+        shown = within(model, steps, self.u, times, m.columns, parameters or None, None)
+        return np.asarray(shown + (at - piece) * missed[:, piece, np.arange(len(m.columns))])
 
 
 @final

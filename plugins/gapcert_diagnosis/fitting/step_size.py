@@ -3,6 +3,7 @@ itself, or blows up."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert.plugin import Array, Model, UsageError, difference, registry
-from gapcert_diagnosis.data.dataset import Windows
+from gapcert_diagnosis.data.dataset import Windows, flat
 from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_engines import EngineModel
 
@@ -37,6 +38,11 @@ def stepped(model: Model, substeps: int, period: float | None = None) -> Model |
     if section.get("kind") != "equations" or {"next", "memory"} & section.keys():
         return None
     return built(section | {"substeps": substeps} | ({} if period is None else {"period": f"{period!r} s"}))
+
+
+def paced(model: Model, parts: float) -> Model:
+    """The same equations with a period 1/parts as long, in sub-steps as long as before."""
+    return built(model.to_spec() | {"period": f"{model.period / parts!r} s", "substeps": round(model.substeps / parts)})
 
 
 def fastest(model: Model, x: Array, u: Array) -> float:
@@ -89,6 +95,33 @@ def settled(model: Model, windows: Windows) -> tuple[Model, tuple[str, ...]]:
         f"stated), as its fastest mode has a time constant of {time:.2g} s"
     )
     return now, (told,)
+
+
+def quickened(model: Model, windows: Windows) -> Model:
+    """A model whose periods are so short that what acts within one may be its mean, where inputs are known to be held.
+
+    They are halved until inputs that come half of one late move rollouts alike, as means and as they come.
+    """
+    m, part, repeat = windows.measured, windows.take(_few(windows)), windows.measured.repeat
+    u = part.drive[:, m.past : m.past + (part.length - 1) * repeat]
+    still = np.zeros((len(part) * part.length, model.nu))
+    while m.hold == "zero" and repeat < THRESHOLDS.most_quickened * m.repeat:
+        finer = stepped(model, math.ceil(model.substeps / 2), model.period / 2)
+        if finer is None:
+            break
+        twice = np.repeat(u, 2, axis=1)
+        late = np.concatenate([u[:, :1], twice[:, :-1]], axis=1)
+        means = late.reshape(*u.shape[:2], 2, -1).mean(axis=2)
+        with np.errstate(all="ignore"):
+            own, other = (
+                one.output(flat(one.fast_rollout(part.start, sent, every=sent.shape[1] // (part.length - 1)).x), still)
+                for one, sent in ((model, means), (finer, late))
+            )
+            apart = difference(m.channels, own[:, m.columns], other[:, m.columns]) / m.sigma
+            if not np.sqrt(np.mean(apart**2, axis=0)).max() > THRESHOLDS.mean_input:
+                break
+        model, repeat, u = finer, 2 * repeat, twice
+    return model
 
 
 def _rolled(model: Model, windows: Windows) -> Array:
