@@ -248,10 +248,13 @@ def _detector(config: DartConfig) -> Any:
 
 def _set_solver(world: Any, config: DartConfig) -> None:
     solver = world.getConstraintSolver()
-    if config.lcp_solver == "nsgs":
-        solver.setBoxedLcpSolver(dartpy.constraint.NsgsFrictionSolver())
-    elif config.lcp_solver == "fbf":
-        solver.setBoxedLcpSolver(dartpy.constraint.FbfFrictionSolver())
+    kinds = {"nsgs": dartpy.constraint.NsgsFrictionSolver, "fbf": dartpy.constraint.FbfFrictionSolver}
+    if (kind := kinds.get(config.lcp_solver)) is not None:
+        round_cone = kind()
+        options = round_cone.getOptions()
+        options.tolerance = config.lcp_tolerance
+        round_cone.setOptions(options)
+        solver.setBoxedLcpSolver(round_cone)
     elif config.lcp_solver == "pgs":
         # Python cannot construct this one; every world has one in reserve.
         solver.setBoxedLcpSolver(dartpy.simulation.World().getConstraintSolver().getSecondaryBoxedLcpSolver())

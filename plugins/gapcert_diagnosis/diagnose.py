@@ -34,6 +34,7 @@ from .search.alternatives import Answer, answered, completed, decided, flags, un
 from .search.candidates import Candidate, Causes, Library
 from .search.criterion import noise, without
 from .search.engine_settings import Setting, Settled, across
+from .search.fitted_sets import FittedSets
 from .search.visible import smallest
 
 T = TypeVar("T")
@@ -224,8 +225,12 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
 
     settled, windows = _settled(data, problem)
     if (quiet := data.quieter(problem, *settled.found)) is not None:
-        data = quiet
-        settled, windows = _settled(data, problem)
+        like = settled if windows is data.windows and not settled.settings else None
+        data, windows = quiet, quiet.windows
+        if like is None or (alike := _as_before(data, problem, like)) is None:
+            settled, windows = _settled(data, problem, None if like is None else like.search)
+        else:
+            settled = alike
     lap("search")
 
     answer, judges = _judged(settled, windows, data.held, problem)
@@ -324,12 +329,13 @@ def _chosen(answer: Answer) -> tuple[str, ...]:
     return (told,) if answer.chosen else ()
 
 
-def _settled(data: Data, problem: DiagnosisProblem) -> tuple[Settled, Windows]:
-    """What a search found, and in which windows.
+def _settled(data: Data, problem: DiagnosisProblem, like: FittedSets | None = None) -> tuple[Settled, Windows]:
+    """What a search found, and in which windows; like: a search of the same ones under other noise floors.
 
     In longer ones where the usual ones are blind to what rollouts over the longest horizon show, and where it is found there.
     """
-    first, tell = across(data.library, problem.effects, data.windows, problem.clock.tell), problem.clock.tell
+    tell = problem.clock.tell
+    first = across(data.library, problem.effects, data.windows, tell, like)
     judge, found, fitted = first.search.far, first.found[1], data.library.measured
     if judge is None or problem.window is not None or fitted.exact or not blind(judge, found, problem.seed):
         return first, data.windows
@@ -342,6 +348,24 @@ def _settled(data: Data, problem: DiagnosisProblem) -> tuple[Settled, Windows]:
         again = replace(again, found=((), again.search.nothing))
     one, two = (float(np.sum(np.maximum(judge.floors(f) ** 2 - 1, 0.0))) for f in (again.found[1], found))
     return (again, windows) if one < THRESHOLDS.foretold_share**2 * two else (first, data.windows)
+
+
+def _as_before(data: Data, problem: DiagnosisProblem, old: Settled) -> Settled | None:
+    """What was found under another floor of the only channel, under its own: all scores change alike, and a search takes the
+    same steps. None where there are more channels, or what is left becomes noise, or rough, or too little for the windows.
+    """
+    causes, before = old.found
+    windows, hold = data.windows, old.search.windows.measured.hold
+    if len(before.chi) > 1:
+        return None
+    windows = windows if hold is None else windows.with_hold(hold)
+    sets = FittedSets(data.library, windows.guard()[0], problem.clock.tell, like=old.search)
+    sets.cautious, sets.negligible = old.search.cautious, dict(old.search.negligible)
+    now = sets.fit(causes, None, before.values)
+    seeing = sets.far is None or problem.window is not None or not blind(sets.far, now, problem.seed)
+    if noise(now, THRESHOLDS.sure_errors) or noise(before, THRESHOLDS.sure_errors) or now.rough != before.rough or not seeing:
+        return None
+    return Settled(sets, (causes, now), ())
 
 
 @final

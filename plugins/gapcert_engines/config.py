@@ -79,6 +79,10 @@ class EngineConfig(BaseModel, ABC):
         """Values worth trying when this engine disagrees with another: dotted option → candidates (a mapping sets several)."""
         return {"substeps": tuple(k for k in (1, 2, 5, 10) if k != self.substeps)}
 
+    def coarse(self) -> dict[str, Any]:
+        """Options with which this engine is much faster and nearly the same, for what is only tried; none by default."""
+        return {}
+
     def others(self, candidates: dict[str, tuple[Any, ...]]) -> dict[str, tuple[Any, ...]]:
         """Of candidates by option those that this section does not have already."""
         left = {name: tuple(v for v in values if v != getattr(self, name)) for name, values in candidates.items()}

@@ -71,6 +71,7 @@ class NativeModel(Model):
         self.parameters = tuple(replace(p, value=self.values.get(n, p.value)) for n, p in (stated | self.stated).items())
         self.inputs, self.period, self.substeps = self.backend.inputs, self.backend.period, self.backend.substeps
         self.capabilities = frozenset(c for c in self.backend.capabilities if c == "parameters")
+        self._coarse: list[NativeModel] = []
         self._wire()
 
     def _wire(self) -> None:
@@ -136,6 +137,19 @@ class NativeModel(Model):
     def set(self, options: Mapping[str, Any]) -> NativeModel:
         """With options of the engine's section at other values; UsageError where it refuses them."""
         return NativeModel(self.of.model_copy(update=dict(options)), self.context, tuple(self.stated.values()), self.values)
+
+    def coarse(self) -> NativeModel:
+        """Nearly the same, and faster where the engine offers that."""
+        if not (options := self.of.coarse()):
+            return self
+        if not self._coarse:
+            self._coarse.append(self.set(options))
+        return self._coarse[0].restated(self.values)
+
+    def close(self) -> None:
+        """Disconnects from the engine; the next step connects again."""
+        for backend in (self.backend, *(m.backend for m in self._coarse)):
+            backend.close()
 
     def natives(self) -> dict[str, float]:
         """Native parameters that differ from the robot file's."""

@@ -240,6 +240,18 @@ def test_sliding_friction(tmp_path, options, mu):
     assert other.step(x, np.zeros((1, 0))).x[0, 1] == pytest.approx(3.0, abs=1e-9)
 
 
+def test_a_coarse_cone_slides_as_far(tmp_path):
+    """What a search may try with: another digest, as bits differ, and nearly the same motion; dantzig has nothing to spare."""
+    fine = build(tmp_path, CRATE, ground=0.3, lcp_solver="nsgs", period="100 ms", substeps=100)
+    options = fine.config.coarse()
+    coarse = build(tmp_path, CRATE, ground=0.3, lcp_solver="nsgs", period="100 ms", substeps=100, **options)
+    x = np.array([[0.0, 3.0, 0.1, 0.0]])
+    assert coarse.digest() != fine.digest()
+    assert not coarse.config.coarse()
+    np.testing.assert_allclose(coarse.step(x, np.zeros((1, 0))).x, fine.step(x, np.zeros((1, 0))).x, atol=2e-3)
+    assert not build(tmp_path, CRATE, ground=0.3).config.coarse()
+
+
 @pytest.mark.parametrize("restitution", [0.0, 0.5, 0.8])
 def test_restitution(tmp_path, restitution):
     b = build(tmp_path, robot(link("base", SPHERE)), restitution=restitution, gravity=(0, 0, 0), substeps=5)

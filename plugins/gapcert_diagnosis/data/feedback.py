@@ -90,8 +90,10 @@ def _surprise(model: Model, measured: Dataset, i: int, rng: np.random.Generator)
     if before <= THRESHOLDS.loop_surprise**2 * float(np.var(u)):
         return 0.0, 0.0
     share = 1 - _left(np.hstack([own, seen]), u) / before
-    turned = [np.roll(seen, int(k), axis=0) for k in rng.integers(len(u) // 4, 3 * len(u) // 4, THRESHOLDS.loop_turns)]
-    return share, max(0.0, *(1 - _left(np.hstack([own, t]), u) / before for t in turned))
+    turns = rng.integers(len(u) // 4, 3 * len(u) // 4, THRESHOLDS.loop_turns).tolist()
+    if share <= THRESHOLDS.loop_surprised:
+        return share, 0.0  # which is none, whatever chance does
+    return share, max(0.0, *(1 - _left(np.hstack([own, np.roll(seen, k, axis=0)]), u) / before for k in turns))
 
 
 def _at_once(model: Model, m: Dataset, i: int) -> list[int]:

@@ -371,6 +371,15 @@ class _Way:
             path[i, at * m.repeat] = np.where(self.blind, np.nan, m.states[p][at])
         return path, u
 
+    @cached_property
+    def first(self) -> tuple[Array, Array, Array]:
+        """The first samples of every piece: states (pieces, n, nx), inputs (pieces, steps, nu); and spreads of the states."""
+        m, pieces = self.measured, self.pieces
+        few = min(max(THRESHOLDS.first_samples, m.samples(THRESHOLDS.free_stretch)), *(len(m.states[p]) - 1 for p in pieces))
+        spread = np.maximum(np.std(np.concatenate(m.states), axis=0), 1e-300)
+        u = np.stack([m.driven[p][: few * m.repeat] for p in pieces])
+        return np.stack([m.states[p][: few + 1] for p in pieces]), u, spread
+
 
 _WAYS = WeakKeyDictionary[Windows, _Way]()
 
@@ -400,33 +409,48 @@ class _Past:
         hidden = _defaults(self.model, self.count, np.array(first))
         if not u[:, 0].any():
             return hidden
-        settled, plain = self._settled(u[:, :1], hidden), self._settled(0 * u[:, :1], hidden)
-        # What moves without an input is bent by the motion, which was another one before.
-        settled = np.where(np.isfinite(settled) & (plain == hidden), settled, hidden)
-        held = self._missed(settled) < self._missed(hidden)
+        settled = self._settled(u[:, :1], hidden)
+        if np.array_equal(settled, hidden):
+            return hidden
+        held = np.less(*self._missed(np.stack([settled, hidden], axis=1)))
         return np.where(held[..., None], settled, hidden)
 
     def _settled(self, u: Array, hidden: Array) -> Array:
-        """What is remembered where the first state, and inputs (pieces, 1, nu), have been held for as long as the log is."""
-        long, path = max(len(self.way.measured.driven[p]) for p in self.way.pieces), self.way.path[0][:, :1]
-        (x, drive), rows, given = (np.repeat(a, long, axis=1) for a in (path, u)), self._rows(len(path)), flat(hidden)
-        found = self.model.fast_memories(x, drive, [long - 1], rows, given)
-        if found is None:
-            begun = np.tile(np.nan_to_num(path[:, 0]), (self.count, 1))
-            found = self.model.fast_rollout(begun, drive, parameters=rows, hidden=given, every=long).hidden
-        return hidden if found is None else found.reshape(hidden.shape)
+        """What is remembered where the first state, and inputs (pieces, 1, nu), have been held for as long as the log is.
+
+        It is gone through in growing parts until nothing moves; what moves without an input is bent by the motion, which was
+        another one before.
+        """
+        way, rows, shape = self.way, self._rows(2 * len(u)), (self.count, 2, *hidden.shape[1:])
+        path, u = np.tile(way.path[0][:, :1], (2, 1, 1)), np.concatenate([u, 0 * u])
+        now, left = np.tile(hidden[:, None], (1, 2, 1, 1)), max(len(way.measured.driven[p]) for p in way.pieces) - 1
+        # A state that no channel shows would begin anew with every part.
+        part, moving = left if way.blind.any() else -(-left // THRESHOLDS.held_parts), True
+        while left > 0 and moving:
+            part, given = min(part, left), now.reshape(-1, hidden.shape[2])
+            x, drive = (np.repeat(a, part, axis=1) for a in (path, u))
+            if (found := self.model.fast_memories(x, drive, [part // 2, part], rows, given)) is None:
+                begun, drive = np.tile(np.nan_to_num(path[:, 0]), (self.count, 1)), np.repeat(u, left, axis=1)
+                found = self.model.fast_rollout(begun, drive, parameters=rows, hidden=given, every=left).hidden
+                now, moving = now if found is None else found.reshape(shape), False
+                continue
+            before, now = (found[:, k].reshape(shape) for k in (0, 1))
+            moving = bool(((before[:, 0] != now[:, 0]) & (now[:, 1] == hidden)).any())
+            left, part = left - part, 2 * part
+        settled, plain = now[:, 0], now[:, 1]
+        return np.where(np.isfinite(settled) & (plain == hidden), settled, hidden)
 
     def _missed(self, hidden: Array) -> Array:
-        """Squares (count, pieces) by which the first samples are missed from there on, in spreads of the states."""
-        m, pieces = self.way.measured, self.way.pieces
-        few = min(max(THRESHOLDS.first_samples, m.samples(THRESHOLDS.free_stretch)), *(len(m.states[p]) - 1 for p in pieces))
-        seen = np.tile([m.states[p][: few + 1] for p in pieces], (self.count, 1, 1))
-        u, rows = np.stack([m.driven[p][: few * m.repeat] for p in pieces]), self._rows(len(pieces))
+        """Squares (k, count, pieces) by which the first samples are missed from hidden states (count, k, pieces, nh) on, in
+        spreads of the states."""
+        (seen, u, spread), k = self.way.first, hidden.shape[1]
+        seen, rows = np.tile(seen, (self.count * k, 1, 1)), self._rows(k * len(u))
         with np.errstate(all="ignore"):
-            moved = self.model.fast_rollout(seen[:, 0], u, parameters=rows, hidden=flat(hidden), every=m.repeat).x
-            off = difference(self.model.states, moved, seen) / np.maximum(np.std(np.concatenate(m.states), axis=0), 1e-300)
+            given = hidden.reshape(-1, hidden.shape[3])
+            moved = self.model.fast_rollout(seen[:, 0], u, parameters=rows, hidden=given, every=self.way.measured.repeat).x
+            off = difference(self.model.states, moved, seen) / spread
         missed = np.sum(np.where(self.way.blind, 0.0, off) ** 2, axis=(1, 2))
-        return np.asarray(np.nan_to_num(missed, nan=np.inf).reshape(hidden.shape[:2]))
+        return np.asarray(np.nan_to_num(missed, nan=np.inf).reshape(hidden.shape[:3]).swapaxes(0, 1))
 
     def _rows(self, pieces: int) -> dict[str, Array | float]:
         return {n: np.repeat(v, pieces) if np.ndim(v) else v for n, v in self.parameters.items()}

@@ -222,14 +222,14 @@ def _noisy(motions: Motions, x: Array, rng: np.random.Generator) -> Array:
 
 def _visible(search: EngineSearch, best: NativeFit) -> dict[str, Any]:
     """Native parameters by what a change of 5 % does to short rollouts: in noise floors, not at all, or alike."""
-    now = {p.name: p.value for p in best.model.parameters}
-    changes = {}
+    model = best.model.coarse()
+    now, changes = {p.name: p.value for p in model.parameters}, dict[str, NativeModel]()
     for n in search.entries:
         if n.parameter is not None and n.option is None:
             value = now[n.native]
             new = value * (1 + THRESHOLDS.probe_step) if value else n.back(n.to(value) + THRESHOLDS.probe_step)
-            changes[n.native] = best.model.restated({n.native: min(max(new, n.parameter.low), n.parameter.high)})
-    moved = sensitivity(search.few, best.model, changes, min(search.horizons))
+            changes[n.native] = model.restated({n.native: min(max(new, n.parameter.low), n.parameter.high)})
+    moved = sensitivity(search.few, model, changes, min(search.horizons))
     size = {n: float(np.sqrt(np.mean(v**2))) for n, v in moved.items()}
     seen = {n: v for n, v in size.items() if v > THRESHOLDS.unseen_effect}
     alike = []

@@ -80,8 +80,10 @@ class EngineSearch:
         return {"best": _named(best.causes), "score": least, "of nothing": of_nothing}
 
     def scores(self, model: NativeModel, motions: Motions | None = None) -> Array:
-        """(trajectories,)"""
-        return score(self.store.errors(motions or self.motions, model, self.horizons))
+        """(trajectories,): of all of them; or of those given, by an engine that may be coarse."""
+        if motions is None:
+            return score(self.store.errors(self.motions, model, self.horizons))
+        return score(self.store.errors(motions, model.coarse(), self.horizons))
 
     def mean(self, model: NativeModel, motions: Motions | None = None) -> float:
         return float(self.scores(model, motions).mean())
@@ -154,7 +156,7 @@ class EngineSearch:
         for value, model in self._variants(best, n, values):
             out.append((self.mean(model, m), value))
             if n.option is not None:
-                model.backend.close()
+                model.close()
         return out
 
     @staticmethod
@@ -207,7 +209,10 @@ class EngineSearch:
             known = s.radius if len(s.radius) <= len(free) else s.radius.max()
             radius[: len(s.radius)] = np.clip(known, 2 * THRESHOLDS.least_radius, THRESHOLDS.first_radius)
         enough = None if start.surface is None else THRESHOLDS.surface_error
-        bounds, scores = [c.bounds for c in free], lambda p: self.scores(_restated(start.model, free, p), motions)
+        bounds, scores = (
+            [c.bounds for c in free],
+            lambda p: self.scores(_restated(start.model, free, p), motions or self.motions),
+        )
         z, surface = descend(scores, first, bounds, radius, rounds, enough)
         return NativeFit(causes, _restated(start.model, free, z), z, surface)
 

@@ -47,8 +47,10 @@ class Settled:
     settings: tuple[Setting, ...]
 
 
-def across(library: Library, effects: Sequence[Effect], windows: Windows, tell: Callable[..., None]) -> Settled:
-    """The search of `stepwise.search_windows`, and again under settings with which the score is better.
+def across(
+    library: Library, effects: Sequence[Effect], windows: Windows, tell: Callable[..., None], like: FittedSets | None = None
+) -> Settled:
+    """The search of `stepwise.search_windows`, like another one, and again under settings with which the score is better.
 
     A setting has no number, but was chosen among as many as there are: it pays as a cause does, unless it takes the place of
     causes, which pay for their numbers already.
@@ -56,7 +58,7 @@ def across(library: Library, effects: Sequence[Effect], windows: Windows, tell: 
     under = _Settings(library, effects, windows, tell)
     variants = library.model.variants()
     if not variants or (plain := fit(library.hypothesis(()), under.earlier)).chi.max() < THRESHOLDS.quiet:
-        return Settled(*search_windows(library, windows, tell, plain if variants else None), ())
+        return Settled(*search_windows(library, windows, tell, plain if variants else None, like), ())
     alone = under.rank(variants, ())
     if (at_once := under.at_once(variants, alone, plain)) is not None:
         return at_once

@@ -16,31 +16,49 @@ from gapcert_diagnosis.fitting.fit import Fit, fit, followed
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Candidate, Causes, Library
-from .criterion import Found, Keys, agrees, beats, better, fails, keys, margin, noise, outdoes, rank, without
+from .criterion import Found, Keys, agrees, beats, fails, keys, margin, noise, outdoes, rank, without
 from .fitted_sets import FittedSets, untold
 from .moves import additions, idle, merges, spared, swaps
 from .selection import drop, forward
 
 
 def search_windows(
-    library: Library, windows: Windows, progress: Callable[..., None] = untold, plain: Fit | None = None
+    library: Library,
+    windows: Windows,
+    progress: Callable[..., None] = untold,
+    plain: Fit | None = None,
+    like: FittedSets | None = None,
 ) -> tuple[FittedSets, Found]:
     """(fitted sets, what was found): on the earlier windows, agreed by the later ones, with the input held as fits best.
 
     A hold that is not declared is zero, unless the other one makes the final model better: a wrong one looks like half a
-    sample of delay, so neither can be chosen before the causes are there. plain: the fit of nothing to the earlier windows.
+    sample of delay, so neither can be chosen before the causes are there. The one that fits plainly better without causes is
+    searched first, and is the answer if it plainly is with them. plain: the fit of nothing to the earlier windows; like: a
+    search of the same windows, under other noise floors.
     """
-    first = _guarded(library, windows, progress, plain)
     if windows.measured.hold is not None:
-        return first
+        return _guarded(library, windows, progress, plain, like)
+    other, earlier, second = windows.with_hold("first"), windows.guard()[0], None
+    plain = fit(library.hypothesis(()), earlier) if plain is None else plain
+    straight = fit(plain.hypothesis, other.guard()[0], theta=plain.theta, start=plain.start)
+    if _plainly(straight, plain):
+        second = _guarded(library, other, progress, straight, like)
+        if _plainly(second[1][1], fit(second[1][1].hypothesis, earlier, theta=second[1][1].theta)):
+            return second
+    first = _guarded(library, windows, progress, plain, like)
     causes, fitted = first[1]
-    other = windows.with_hold("first")
     again = fit(fitted.hypothesis, other.guard()[0], theta=fitted.theta)
-    if better(again, fitted) <= THRESHOLDS.tie_score:
+    if first[0].better(again, fitted) <= THRESHOLDS.tie_score:
         return first
-    second = _guarded(library, other, progress, like=first[0])
+    second = second or _guarded(library, other, progress, like=first[0])
     fewer = len(second[1][0]) < len(causes)
-    return second if better(second[1][1], fitted) > (-THRESHOLDS.tie_score if fewer else THRESHOLDS.tie_score) else first
+    gained = first[0].better(second[1][1], fitted)
+    return second if gained > (-THRESHOLDS.tie_score if fewer else THRESHOLDS.tie_score) else first
+
+
+def _plainly(new: Fit, old: Fit) -> bool:
+    """Does it leave so much less that no other cause could be the reason?"""
+    return bool((new.chi < THRESHOLDS.plain_hold * old.chi).all())
 
 
 def _guarded(
@@ -90,7 +108,7 @@ class EquationSearch:
         if not self.thorough and (few := self.try_piles()) is not None:
             return few
         best = forward(self)
-        if not best[0] or self.enough(best):
+        if not best[0] or self.enough(best) or (best[1].chi.max() > THRESHOLDS.lost_search and not self.sets.cautious):
             return best
         small, large = sorted([best, forward(self, THRESHOLDS.beam, self.enough)], key=lambda f: len(f[0]))
         return large if self.outdoes(large, small) else small
