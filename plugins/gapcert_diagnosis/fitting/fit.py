@@ -130,6 +130,9 @@ def fit(
                 "a shorter diagnose.window"
             )
     ends, given, more = _Ends.of(windows), windows, max(THRESHOLDS.retraced_iterations, iterations // 2)
+    if start is None and not windows.start.any(axis=0).all():
+        # A state that no channel shows begins anywhere: numbers would go astray to make up for it.
+        here = _settle(h, part, here, ends)[0]
     for k in range(THRESHOLDS.begun_rounds):
         if (begun := _begun(h, windows, here, ends)) is not None:
             h, part = begun, _leaning(begun, windows, here.theta)
