@@ -93,22 +93,30 @@ def test_an_oven_may_be_late_by_minutes(name, number):
     assert only(found, name) == {number: pytest.approx(80, rel=0.05)}
 
 
-@pytest.mark.parametrize("name", ["input-lag", "input-rate-limit"])
-def test_a_log_may_begin_at_an_input_that_was_held(name):
-    def rated(u, h):
-        out, reached = np.empty_like(u), u[0]
+@pytest.mark.parametrize(
+    ("name", "number", "held"),
+    [("input-lag", 90.0, None), ("input-rate-limit", 0.06, None), ("input-lag", 90.0, 8.0), ("input-delay", 22.0, 3.0)],
+)
+def test_a_log_may_begin_at_an_input_that_was_held(name, number, held):
+    """At its first input, or at another one that nothing in the log shows."""
+
+    def rated(u, before, h):
+        out, reached = np.empty_like(u), before
         for k, level in enumerate(u):
-            moved = np.clip(level - reached, -0.06 * h, 0.06 * h)
+            moved = np.clip(level - reached, -number * h, number * h)
             out[k], reached = reached + moved / 2, reached + moved
         return out
 
     def late(u, h):
-        return rated(u, h) if name == "input-rate-limit" else u[0] + lagged(u - u[0], 90.0, h)
+        before = u[0] if held is None else held
+        if name == "input-delay":
+            return delayed(np.concatenate([[before], u]), number, h)[1:]
+        return rated(u, before, h) if name == "input-rate-limit" else before + lagged(u - before, number, h)
 
     u = 6 + 5 * commands(600, 30, 12)
     section, slope, _ = OVEN
-    found = only(told((section, slope, 290 + u[0] / 0.0525), u, late), name)
-    assert list(found.values()) == [pytest.approx(90.0 if name == "input-lag" else 0.06, rel=0.05)]
+    found = only(told((section, slope, 290 + (u[0] if held is None else held) / 0.0525), u, late), name)
+    assert list(found.values()) == [pytest.approx(number, rel=0.05)]
 
 
 def test_two_lags_are_one_of_second_order():

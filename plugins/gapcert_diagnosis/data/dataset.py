@@ -166,6 +166,10 @@ class Dataset:
         drives = {h: tuple(d[i][part] for i, part in fine) for h, d in self.drives.items()}
         return replace(self, **parts, drives=drives, source=tuple(self.source[i] for i, _ in kept))
 
+    def beginning(self, piece: int) -> tuple[float, ...]:
+        """What tells a piece from others, also in other parts of the recording: when it begins, and with what values."""
+        return float(self.times[piece][0]), *self.outputs[piece][0].tolist()
+
     def first(self, piece: int) -> int:
         """The first sample of a piece at which a window may begin."""
         since = self.since[self.source[piece]] if self.since else -math.inf

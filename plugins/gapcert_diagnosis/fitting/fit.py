@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import final
 
@@ -129,13 +129,22 @@ def fit(
                 "recording.units: {TIME: ms}; otherwise look at the model's units and signs, the recording's columns, or give "
                 "a shorter diagnose.window"
             )
-    ends, given = _Ends.of(windows), windows
-    here = _led_down(h, windows, part, here, ends, iterations)
+    ends, given, more = _Ends.of(windows), windows, max(THRESHOLDS.retraced_iterations, iterations // 2)
+    if start is None and not windows.start.any(axis=0).all():
+        # A state that no channel shows begins anywhere: numbers would go astray to make up for it.
+        here = _settle(h, part, here, ends)[0]
+    for k in range(THRESHOLDS.begun_rounds):
+        if (begun := _begun(h, windows, here, ends)) is not None:
+            h, part = begun, _leaning(begun, windows, here.theta)
+            here = _linearise(h, part, here.theta, here.start)
+        elif k:
+            break
+        here = _led_down(h, windows, part, here, ends, more if k else iterations)
     for _ in range(THRESHOLDS.retraced_memories if h.model.remembers else 0):
         if (again := _retraced(h, windows, here, ends)) is None:
             break
         windows, part, here = again
-        here = _led_down(h, windows, part, here, ends, max(THRESHOLDS.retraced_iterations, iterations // 2))
+        here = _led_down(h, windows, part, here, ends, more)
     temper = max(1.0, float(squares(here.residual).sum()) / ends.n)
     schur = reduced(h, here, temper, np.zeros(1))[0][0]
     size = here.width[: len(theta)]
@@ -260,6 +269,51 @@ def _descended(h: Hypothesis, windows: Windows, here: Slopes, ends: _Ends, itera
         if gained < ends.enough(before):
             break
     return here, iterations
+
+
+def _begun(h: Hypothesis, windows: Windows, here: Slopes, ends: _Ends) -> Hypothesis | None:
+    """With what acted before the pieces began: nothing, or their first inputs, whichever leaves less over their first windows,
+    and another input where that leaves plainly less. None where little changes.
+    """
+    m, p, k = windows.measured, len(here.theta), THRESHOLDS.begun_values
+    if m.exact or not any(s.name != "time" for s in h.model.hidden):
+        return None
+    pieces, of = np.unique(windows.place[:, 0], return_inverse=True)
+    keys, first = [m.beginning(i) for i in pieces.tolist()], np.stack([m.driven[i][0] for i in pieces.tolist()])
+    if not p and all(key in h.acted for key in keys):
+        return None
+    rows = np.concatenate([np.flatnonzero(of == i)[: THRESHOLDS.begun_windows] for i in range(len(pieces))])
+    part, start, held = windows.take(rows), here.start[rows][None], h.holding(here.theta)
+    basis = np.linalg.qr(here.rows[rows][:, p:].swapaxes(1, 2))[0]
+
+    def left(acted: Array) -> Array:
+        r = _residual(replace(held, acted=dict(zip(keys, acted, strict=True))), part, np.empty((1, 0)), start)[0]
+        flat = np.nan_to_num(r.reshape(len(rows), -1), nan=THRESHOLDS.steepest)
+        flat = flat - (basis @ (flat[:, None] @ basis).swapaxes(1, 2))[..., 0]
+        return np.asarray(np.bincount(of[rows], squares(flat)))
+
+    ways = [0 * first, first]
+    lost = [left(way) for way in ways]
+    best, square = (a[int(lost[1].sum() < lost[0].sum())] for a in (ways, lost))
+    fitted, least, span = best.copy(), square.copy(), np.concatenate(m.inputs)
+    for i, (low, high) in enumerate(zip(span.min(axis=0).tolist(), span.max(axis=0).tolist(), strict=True)):
+        tried = np.stack([np.where(np.arange(first.shape[1]) == i, v, fitted) for v in np.linspace(low, high, k)])
+        over = np.stack([left(way) for way in tried])
+        at = np.clip(over.argmin(axis=0), 1, k - 2)
+        a, b, c = (over[at + j, np.arange(len(at))] for j in (-1, 0, 1))
+        vertex = 0.5 * (a - c) / np.where(a + c > 2 * b, a - 2 * b + c, np.inf)
+        new = fitted.copy()
+        new[:, i] = low + (high - low) / (k - 1) * (at + np.clip(vertex, -k, k))
+        now = left(new)
+        fitted, least = np.where((now < least)[:, None], new, fitted), np.minimum(now, least)
+    each = np.maximum(1.0, least / np.bincount(of[rows], np.count_nonzero(part.weight, axis=(1, 2))))
+    plain = square - least > (THRESHOLDS.number_score + 2 * math.log(len(pieces))) * each
+    best = np.where(plain[:, None], fitted, best)
+    now = np.stack([h.acted.get(key, way) for key, way in zip(keys, best, strict=True)])
+    gained = left(now) - np.where(plain, least, square) if h.acted else np.maximum(np.abs(lost[0] - lost[1]), square - least)
+    if gained.sum() < ends.enough(float(np.sum(here.residual**2))):
+        return None
+    return replace(h, acted={**h.acted, **dict(zip(keys, best, strict=True))}, begun=int(plain.sum()))
 
 
 def _retraced(h: Hypothesis, windows: Windows, here: Slopes, ends: _Ends) -> tuple[Windows, Windows, Slopes] | None:

@@ -20,11 +20,18 @@ from gapcert.plugin import Array, Model, difference
 from gapcert_diagnosis.data.dataset import Dataset, Windows, flat
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
+Acted = Mapping[tuple[float, ...], Array]
+NOTHING: Acted = {}
+
 
 @final
 @dataclass(frozen=True)
 class Hypothesis:
-    """A model with free numbers: first values, bounds, difference steps; sd: of a normal prior about `value`, inf for none."""
+    """A model with free numbers: first values, bounds, difference steps; sd: of a normal prior about `value`, inf for none.
+
+    acted: beginning of a piece of a recording → inputs (nu,) that had always acted before it, where that is known; begun: how
+    many of these are fitted.
+    """
 
     model: Model
     names: tuple[str, ...] = ()
@@ -34,11 +41,13 @@ class Hypothesis:
     step: Array = field(default_factory=lambda: np.empty(0))
     sd: Array = field(default_factory=lambda: np.empty(0))
     fixed: Mapping[str, float] = field(default_factory=dict)
+    acted: Acted = field(default_factory=dict)
+    begun: int = 0
 
     @property
     def charged(self) -> int:
         """Free numbers that the nominal model does not have."""
-        return int(np.isinf(self.sd).sum())
+        return int(np.isinf(self.sd).sum()) + self.begun
 
     def theta(self, known: Mapping[str, float]) -> Array:
         """Numbers (p,): those that are known, and the others as they are stated."""
@@ -50,7 +59,8 @@ class Hypothesis:
 
     def holding(self, theta: Array) -> Hypothesis:
         """With all numbers fixed at theta."""
-        return Hypothesis(self.model, fixed={**self.fixed, **dict(zip(self.names, theta.tolist(), strict=True))})
+        known = {**self.fixed, **dict(zip(self.names, theta.tolist(), strict=True))}
+        return Hypothesis(self.model, fixed=known, acted=self.acted)
 
     def simulate(self, windows: Windows, theta: Array, start: Array) -> Array:
         """Outputs (b, W, L, ny) from theta (b, p) and starts (b, W, nx), at the times of the samples.
@@ -69,7 +79,7 @@ class Hypothesis:
             if shows_states(self.model):
                 shown = x.reshape(b * w * length, -1)
             else:
-                shown = seen(self.model, windows, x, values, hidden).reshape(b * w * length, -1)
+                shown = seen(self.model, windows, x, values, hidden, acted=self.acted).reshape(b * w * length, -1)
             every = m.columns == tuple(range(shown.shape[1]))
             y = (shown if every else shown[:, m.columns]).reshape(b, w, length, -1)
             if ahead.any():
@@ -115,7 +125,7 @@ class Hypothesis:
         part = windows.take(rows)
         past, nx = part.measured.past, start.shape[1]
         u, before, values = part.drive[:, :past], part.before.copy(), self._values(theta[None], len(part))
-        hidden = recalled(self.model, part, self._values(theta[None], 1), 1)
+        hidden = recalled(self.model, part, self._values(theta[None], 1), 1, self.acted)
         size = nudges(start)
         many = {n: np.tile(v, nx + 1) if np.ndim(v) else v for n, v in values.items()}
         for _ in range(THRESHOLDS.history_shots):
@@ -165,7 +175,7 @@ class Hypothesis:
     def hidden(self, windows: Windows, theta: Array) -> Array:
         """Hidden states (b·W, nh) at the windows' beginnings, from motions through the history before them."""
         b, w, u = len(theta), len(windows), windows.drive[:, : windows.measured.past]
-        hidden = recalled(self.model, windows, self._values(theta, 1), b)
+        hidden = recalled(self.model, windows, self._values(theta, 1), b, self.acted)
         before, values = np.tile(windows.before, (b, 1)), self._values(theta, w)
         after = self.model.fast_rollout(before, u, parameters=values, hidden=hidden, every=max(1, u.shape[1])).hidden
         return hidden if after is None else after
@@ -234,7 +244,13 @@ def within(
 
 
 def seen(
-    model: Model, windows: Windows, x: Array, values: Mapping[str, Array | float], hidden: Array | None, back: int = 0
+    model: Model,
+    windows: Windows,
+    x: Array,
+    values: Mapping[str, Array | float],
+    hidden: Array | None,
+    back: int = 0,
+    acted: Acted = NOTHING,
 ) -> Array:
     """Outputs (n, K, ny) at K samples from `back` before each window on, of motions x (n, K, nx), W dividing n.
 
@@ -243,7 +259,7 @@ def seen(
     n, count, w, m = *x.shape[:2], len(windows), windows.measured
     u: Array = windows.u[None, :, m.history - back :][:, :, :count]
     if (late := model.input_delays(values)).any():
-        u = _arriving(windows, np.broadcast_to(late, (n, model.nu)).reshape(-1, w, model.nu), count, back)
+        u = _arriving(windows, np.broadcast_to(late, (n, model.nu)).reshape(-1, w, model.nu), count, back, acted)
     rows = {k: np.repeat(v, count) if np.ndim(v) else v for k, v in values.items()}
     known = None
     if hidden is not None and shows_memory(model):
@@ -253,14 +269,15 @@ def seen(
     return model.output(flat(x), flat(u), rows, known).reshape(n, count, -1)
 
 
-def _arriving(windows: Windows, late: Array, count: int, back: int) -> Array:
+def _arriving(windows: Windows, late: Array, count: int, back: int, acted: Acted) -> Array:
     """Inputs (b, W, count, nu) as they arrive `late` (b, W, nu) seconds after they were sent, as they are held."""
     m, out = windows.measured, np.empty((*late.shape[:2], count, late.shape[2]))
     for k, (piece, first) in enumerate(windows.place.tolist()):
         at = first - back + np.arange(count) - late[:, k, :, None] / m.period
-        at = np.clip(at if m.hold == "first" else np.floor(at + THRESHOLDS.whole_sample), 0, None)
+        at = at if m.hold == "first" else np.floor(at + THRESHOLDS.whole_sample)
+        before = acted.get(m.beginning(piece), m.inputs[piece][0])
         for j, sent in enumerate(m.inputs[piece].T):
-            out[:, k, :, j] = np.interp(at[:, j], np.arange(len(sent)), sent)
+            out[:, k, :, j] = np.interp(at[:, j], np.arange(len(sent)), sent, left=before[j])
     return out
 
 
@@ -289,7 +306,9 @@ def memories(model: Model, x: Array, drive: Array, values: Mapping[str, Array | 
     return np.stack(out, axis=1)
 
 
-def recalled(model: Model, windows: Windows, parameters: Mapping[str, Array | float], count: int) -> Array:
+def recalled(
+    model: Model, windows: Windows, parameters: Mapping[str, Array | float], count: int, acted: Acted = NOTHING
+) -> Array:
     """Hidden states (count·W, nh), `history` samples before each window, for parameters of shape (count,) or ().
 
     A lag, a play or a sagging supply knows more of the past than the history before a window tells.
@@ -300,20 +319,21 @@ def recalled(model: Model, windows: Windows, parameters: Mapping[str, Array | fl
             first = windows.place[:, 1] - windows.measured.history
             rows = {piece: np.flatnonzero(windows.place[:, 0] == piece) for piece in np.unique(windows.place[:, 0]).tolist()}
             _WAYS[windows] = _Way(windows.measured, rows, {p: first[r] for p, r in rows.items()})
-        for piece, hidden in _Past(model, _WAYS[windows], parameters, count).found().items():
+        for piece, hidden in _Past(model, _WAYS[windows], parameters, count, acted).found().items():
             out[:, _WAYS[windows].rows[piece]] = hidden
-    _commanded(model, windows, out)
+    _commanded(model, windows, out, acted)
     return out.reshape(count * len(windows), -1)
 
 
-def _commanded(model: Model, windows: Windows, out: Array) -> None:
-    """Late inputs among hidden states (count, W, nh), as they were commanded; before a recording its first input acted."""
+def _commanded(model: Model, windows: Windows, out: Array, acted: Acted) -> None:
+    """Late inputs among hidden states (count, W, nh), as they were commanded; before a recording what acted, or the first."""
     m, inputs, names = windows.measured, [s.name for s in model.inputs], [s.name for s in model.hidden]
     for i, name in enumerate(inputs):
         late = [j for j, n in enumerate(names) if n.rpartition("_")[0] == f"{name}_delay"]
         back = np.array([int(names[j].rpartition("_")[2]) for j in late], dtype=int)
         for w, (piece, first) in enumerate(windows.place.tolist() if late else ()):
-            out[:, w, late] = m.driven[piece][np.maximum((first - m.history) * m.repeat - back, 0), i]
+            at, sent = (first - m.history) * m.repeat - back, m.driven[piece]
+            out[:, w, late] = np.where(at < 0, acted.get(m.beginning(piece), sent[0])[i], sent[np.maximum(at, 0), i])
 
 
 def _defaults(model: Model, count: int, t: Array) -> Array:
@@ -393,6 +413,7 @@ class _Past:
     way: _Way
     parameters: Mapping[str, Array | float]
     count: int
+    acted: Acted = field(default_factory=dict)
 
     def found(self) -> dict[int, Array]:
         """Per piece, hidden states (count, stops, nh)."""
@@ -403,17 +424,20 @@ class _Past:
     def start(self) -> Array:
         """Hidden states (count, pieces, nh) at the first sample: nothing acted before a recording, or its first input did.
 
-        A machine that is just switched on, or at an operating point: the first samples tell.
+        A machine that is just switched on, or at an operating point: the first samples tell, where it is not known what acted.
         """
-        u, first = self.way.path[1], [self.way.measured.times[p][0] for p in self.way.pieces]
+        first = [self.way.measured.times[p][0] for p in self.way.pieces]
         hidden = _defaults(self.model, self.count, np.array(first))
-        if not u[:, 0].any():
+        given = [self.acted.get(self.way.measured.beginning(p)) for p in self.way.pieces]
+        u = np.stack([a if b is None else b for a, b in zip(self.way.path[1][:, 0], given, strict=True)])[:, None]
+        if not u.any():
             return hidden
-        settled = self._settled(u[:, :1], hidden)
+        settled = self._settled(u, hidden)
         if np.array_equal(settled, hidden):
             return hidden
-        held = np.less(*self._missed(np.stack([settled, hidden], axis=1)))
-        return np.where(held[..., None], settled, hidden)
+        held = np.array([b is not None for b in given])
+        held = held if held.all() else held | np.less(*self._missed(np.stack([settled, hidden], axis=1)))
+        return np.where(np.broadcast_to(held, hidden.shape[:2])[..., None], settled, hidden)
 
     def _settled(self, u: Array, hidden: Array) -> Array:
         """What is remembered where the first state, and inputs (pieces, 1, nu), have been held for as long as the log is.

@@ -140,7 +140,7 @@ class Path:
     def __init__(self, windows: Windows, guess: Fit, start: Array) -> None:
         """start (W, nx): of these windows, as the guess has them."""
         m, repeat = windows.measured, windows.measured.repeat
-        self.windows, self.lead = windows, m.past
+        self.windows, self.lead, self.acted = windows, m.past, guess.hypothesis.acted
         steps = self.lead + (windows.length - 1) * repeat
         self.u = windows.drive[:, :steps]
         samples = np.stack([m.states[i][s - m.history : s + windows.length] for i, s in windows.place.tolist()])
@@ -174,7 +174,7 @@ class Path:
             x.reshape(copies * w, *x.shape[2:]),
             u.reshape(copies * w, *u.shape[2:]),
             parameters={n: np.repeat(v, w) for n, v in parameters.items()} or None,
-            hidden=recalled(model, self.windows, parameters, copies) if model.hidden else None,
+            hidden=recalled(model, self.windows, parameters, copies, self.acted) if model.hidden else None,
         )
         return np.asarray(new.reshape(copies, w, *new.shape[1:])[:, :, self.lead - first :])
 
@@ -182,11 +182,11 @@ class Path:
         """Measured channels (W, L, ny) of the path, late where the model says so."""
         m, count = self.windows.measured, self.samples.shape[1]
         rows = {n: np.array([v]) for n, v in parameters.items()}
-        hidden = recalled(model, self.windows, rows, 1) if shows_memory(model) else None
+        hidden = recalled(model, self.windows, rows, 1, self.acted) if shows_memory(model) else None
         late = model.output_delays(parameters or None) / m.period
         if late.any() and m.hold == "zero" and shows_states(model):
             return self._late(model, parameters, moved, late[list(m.columns)])
-        y = seen(model, self.windows, self.samples + moved, parameters, hidden, m.history)
+        y = seen(model, self.windows, self.samples + moved, parameters, hidden, m.history, self.acted)
         at, out = np.arange(count), y.copy()
         for c in np.flatnonzero(late).tolist():
             for w in range(len(y)):

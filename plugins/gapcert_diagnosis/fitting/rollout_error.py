@@ -65,12 +65,11 @@ class Stretches:
 
     def _simulated(self, fitted: Fit) -> tuple[Array, Array]:
         """(outputs, starts); the search for starts begins where that of another fit ended, or at what was measured."""
-        hypothesis = fitted.hypothesis.holding(fitted.theta)
         known = next((start for _, _, start in self._rolled.values()), None)
-        start = followed(fitted.hypothesis, fitted.theta, self.windows.head(self.lead), known).start
-        y = hypothesis.simulate(self.windows, np.empty((1, 0)), start[None])[0, :, self.lead :]
+        led = followed(fitted.hypothesis, fitted.theta, self.windows.head(self.lead), known)
+        y = led.hypothesis.simulate(self.windows, np.empty((1, 0)), led.start[None])[0, :, self.lead :]
         # A model that blows up over the horizon is as wrong as anything can be, and a comparison needs a number.
-        return np.nan_to_num(y, nan=1e6, posinf=1e6, neginf=-1e6), start
+        return np.nan_to_num(y, nan=1e6, posinf=1e6, neginf=-1e6), led.start
 
     def squares(self, fitted: Fit) -> Array:
         """Mean squared error (W, ny) of every rollout and channel."""

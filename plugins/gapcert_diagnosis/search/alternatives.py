@@ -129,7 +129,9 @@ def completed(search: FittedSets, answer: Answer, judge: Stretches, seed: int) -
     bases = [(answer.causes, search.fit(answer.causes, None, old.values))] if answer.causes else []
     bases += sorted(alone, key=lambda f: far.error(f[1]))[:1]
     some = [*alone, *(f for base in bases for f in _grown(search, base))]
-    return next((f for f in sorted(some, key=lambda f: far.error(f[1])) if completes(f)), None)
+    # One cause more has to be worth it there, too.
+    some.sort(key=lambda f: far.error(f[1]) / THRESHOLDS.foretold_share ** len(f[0]))
+    return next((f for f in some if completes(f)), None)
 
 
 def _grown(search: FittedSets, base: Found) -> list[Found]:
