@@ -46,6 +46,7 @@ KINDS = (
     "input-gain:slip",
     "sensor-scale:slip",
 )
+LATER, FIRST = ("sensor-lag",), 400  # more in turn would draw every exam anew: these are drawn from that index on
 ALIKE = (*KINDS[:3], *KINDS[5:7], *KINDS[8:14])  # with rivals that an input tells apart
 UNSLIPPED = tuple(k for k in KINDS if not k.endswith(":slip"))
 TURNED = (math.pi / 180, 60 / (2 * math.pi), 1000.0, 9.80665)
@@ -213,6 +214,8 @@ def alike(r: Rig, h: Hidden) -> list[tuple[str, str]]:
         groups += [gains | ({("parameter", "K")} if name == "wheel" else set())]
     if alone:
         groups += [{("input-delay", u), ("sensor-delay", y)}]
+    if alone and (linear or name in ("heater", "oven")):
+        groups += [{("input-lag", u), ("sensor-lag", y)}]
     if alone and (linear or name in ("heater", "oven")):
         # A constant twist between two speeds shows in neither, and a constant voltage at a condenser not in its current.
         unseen = {"tw", *(("i",) if (name, y) == ("rlc", "i") else ())}
@@ -384,6 +387,7 @@ def shape(kind: str, site: str, r: Rig, rng: np.random.Generator, still: tuple[A
         "sensor-bias": (lambda k: {"bias": sign * k * swing}, 1.0),
         "sensor-scale": (lambda k: {"scale": 1 + k if sign > 0 else 1 / (1 + k)}, 0.5),
         "sensor-delay": (lambda k: {"delay": k * late}, 1.0),
+        "sensor-lag": (lambda k: {"time_constant": k * slow}, 1.0),
     }
     return shapes[kind]
 
@@ -436,6 +440,7 @@ def _drawn(name: str, rng: np.random.Generator, waves: Sequence[str] = WAVES) ->
 def single(part: str, seed: int, index: int, waves: Sequence[str] = WAVES) -> Case:
     """One effect, kinds in turn, in a plant that can have it; drawn again until it is clear."""
     rng, kinds, best = generator(part, seed, index), KINDS if waves == WAVES else UNSLIPPED, None
+    kinds = kinds if index < FIRST else LATER
     kind, names = kinds[index % len(kinds)], NAMES if waves == WAVES else LOOPED
     for _ in range(40):
         r = _drawn(str(rng.choice(names)), rng, WAVES[:3] if kind.endswith(":slip") else waves)

@@ -231,6 +231,9 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
             settled, windows = _settled(data, problem, None if like is None else like.search)
         else:
             settled = alike
+    if not settled.found[0] and (begun := data.whole(problem, settled.found[1])) is not None:
+        data = begun
+        settled, windows = _settled(data, problem)
     lap("search")
 
     answer, judges = _judged(settled, windows, data.held, problem)
@@ -391,6 +394,19 @@ class Data:
         library = self.library.under(self.library.model, problem.effects, less)
         held = replace(self.held, sigma=library.measured.sigma)
         return replace(self, library=library, windows=replace(self.windows, measured=library.measured), held=held)
+
+    def whole(self, problem: DiagnosisProblem, found: Fit) -> Data | None:
+        """With windows from the first samples on, where a fit leaves more of these: what acts only there is seen."""
+        m, length = replace(self.library.measured, whole=True), self.windows.length
+        first = [(i, m.history) for i, y in enumerate(m.outputs) if len(y) >= m.history + length]
+        if self.library.measured.history == m.history or not first:
+            return None
+        begun = followed(found.hypothesis, found.theta, m.at(np.array(first), length))
+        if (np.sqrt(begun.chi / np.maximum(found.chi, 1.0)) < THRESHOLDS.loud_channel).all():
+            return None
+        library = self.library.under(self.library.model, problem.effects, m)
+        windows = library.measured.windows(length).thinned(THRESHOLDS.fitted_values, THRESHOLDS.guard_windows)
+        return replace(self, library=library, windows=windows)
 
     def calm(self, problem: DiagnosisProblem, pushed: Sequence[Push]) -> Data | None:
         """Between pushes, where these are an effect that may be named, no law of a place, and enough is left between them."""

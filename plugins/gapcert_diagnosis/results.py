@@ -19,7 +19,7 @@ load-dependent-friction asymmetric-coulomb-friction asymmetric-viscous-friction 
 constant-force gravity-tilt cogging payload joint-coupling backlash external-push parameter
 contact-friction contact-restitution engine-setting input-gain input-offset input-dead-zone input-saturation
 wheel-slip side-slip input-nonlinearity input-hysteresis input-delay input-lag input-rate-limit input-rate-limited-lag
-supply-sag sensor-bias sensor-scale sensor-delay sensor-quantisation
+supply-sag sensor-bias sensor-scale sensor-delay sensor-lag sensor-quantisation
 """
 ORDER = tuple(_ORDER.split())
 

@@ -16,6 +16,7 @@ from gapcert.plugin import PLAIN, Array, Effect, Model, Recording, expect, multi
 
 from .data.dataset import Dataset
 from .fitting.fit import fit, promising
+from .fitting.hypothesis import memories, shows_memory
 from .fitting.step_size import built as equations
 from .search.candidates import Candidate, Library
 
@@ -241,7 +242,10 @@ class EffectContract(ABC):
         """What a motion shows (T, ny), each output as late as it is."""
         u = self._input(nominal)
         x0 = np.linspace(0.6, 0.3, nominal.nx)[None]
-        y = model.output(model.fast_rollout(x0, u[None, :-1]).x[0], u)
+        x, known = model.fast_rollout(x0, u[None, :-1]).x, None
+        if shows_memory(model):
+            known = memories(model, x, u[None, :-1], {}, np.array([model.hidden_default]), 1)[0]
+        y = model.output(x[0], u, None, known)
         t = np.arange(len(u)) * model.period
         late = model.output_delays()
         return np.stack([y[:, i] if d == 0 else CubicSpline(t, y[:, i])(t - d) for i, d in enumerate(late)], axis=-1)

@@ -261,7 +261,9 @@ class Thresholds:
         (("deg/rad", math.pi / 180), ("rpm/(rad/s)", 60 / math.tau), ("1000", 1000.0), ("g", 9.80665)),
         "factors, and their inverses, of units that logs confuse",
     )
-    near_slip: float = chosen(0.01, "of such a factor: two of them are 2.7 % apart")
+    near_slip: float = chosen(
+        0.03, "of such a factor: what a model's own numbers are worth; of two, 2.7 % apart, the nearer one"
+    )
     sure_slip: float = chosen(0.002, "the same, where the interval is narrower than what the model's own numbers are worth")
     moved_edges: int = chosen(2, "times that an edge of what is tried moves out tenfold, where a number lies at it")
     at_bound: float = chosen(1e-6, "of the width of a number's bounds: what ends closer is told to be at one")

@@ -355,7 +355,14 @@ class InputLag(Law):
     family = "late"
     stage = 50
     variants = (SecondOrderLag,)
-    rivals: ClassVar = {"input-delay": FAST, "input-rate-limit": SMALL_AND_LARGE, "sensor-delay": FAST, "backlash": FREE_DECAY}
+    equivalent: ClassVar = {"sensor-lag": "where the motion is linear, and one output is measured of what one input moves"}
+    rivals: ClassVar = {
+        "input-delay": FAST,
+        "input-rate-limit": SMALL_AND_LARGE,
+        "sensor-delay": FAST,
+        "sensor-lag": SECOND,
+        "backlash": FREE_DECAY,
+    }
 
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         return [(t,) for t in times(self.parameters[0], scales, 0.3)]

@@ -7,8 +7,9 @@ from typing import ClassVar, final
 
 import numpy as np
 
+import gapcert as gc
 from gapcert import Array
-from gapcert.plugin import EffectParameter
+from gapcert.plugin import EffectParameter, Extension, Memory, site_units
 from gapcert_effects.thresholds import THRESHOLDS
 
 from .experiments import CREEP, FAST, FREE_DECAY, PLACES, SECOND
@@ -72,6 +73,41 @@ class SensorDelay(Law):
 
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
         return [(t,) for t in times(self.parameters[0], scales)]
+
+
+_BEHIND = "{time_constant}/{h}*(1 - exp(-{h}/max({time_constant}, 0.001*{h})))"
+"""By how much of a steady slope per sub-step the reading falls back in one, over what it does in the end."""
+
+
+@final
+class SensorLag(Law):
+    """z is seen, T·ż = y − z, from z = y on: exact for a y that is straight over each sub-step.
+
+    With E = exp(−h/T) and c = T/h·(1 − E) the hidden state m = z − (1 − c)·y needs no later y: m⁺ = E·m + c·(1 − E)·y.
+    """
+
+    name = "sensor-lag"
+    site = "output"
+    parameters = (
+        EffectParameter("time_constant", {"period": 1}, (1.0, 3.0), 0.0, float("inf"), longest=THRESHOLDS.slowest_sensor),
+    )
+    equation = "z is seen, time_constant·ż = y − z"
+    signature = "this output arrives rounded, and what is fast in it smaller and late, whatever moves it"
+    experiment = SECOND
+    family = "late"
+    equivalent: ClassVar = {"input-lag": "where the motion is linear, and one output is measured of what one input moves"}
+    rivals: ClassVar = {"input-lag": SECOND, "sensor-delay": FAST, "input-delay": SECOND}
+
+    def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
+        return [(t,) for t in times(self.parameters[0], scales, 0.3)]
+
+    def extension(self, site: str, model: gc.Model) -> Extension:
+        (own,), unit = self.named(site, model), site_units(model, self.site, site)["output"]
+        kept, begun = (f"{own.name}_{end}" for end in ("reached", "begun"))
+        c, left = (t.format(time_constant=own.name, h="{h}") for t in (_BEHIND, "exp(-{h}/max({time_constant}, 0.001*{h}))"))
+        now = f"(1 - {begun})*{c}*{{y}} + {begun}*{kept}"
+        memory = (Memory(kept, unit, f"({now})*{left} + {c}*(1 - {left})*{{y}}"), Memory(begun, "1", "1"))
+        return Extension(self.name, site, (own,), output=f"{{y}} + {begun}*({kept} - {c}*{{y}})", memory=memory)
 
 
 @final

@@ -49,6 +49,7 @@ HOMES = {
         "sensor-bias": "a sensor whose zero is wrong",
         "sensor-scale": "a sensor that shows too much or too little",
         "sensor-delay": "a sensor that shows the past",
+        "sensor-lag": "a sensor that follows what it measures through a first-order lag",
         "sensor-quantisation": "a sensor that shows only multiples of its resolution",
     },
 }

@@ -27,6 +27,7 @@ class Thresholds:
     latest_input: float = chosen(0.1, "of the duration of the data, that an input comes late at most")
     latest_periods: float = chosen(1000.0, "of delay, at most: each is a hidden state")
     slowest_lag: float = chosen(1.0, "of the duration of the data, of a time constant at most")
+    slowest_sensor: float = chosen(0.3, "of the duration of the data, of a sensor's time constant: slower ones show no motion")
     latest_output: float = chosen(0.05, "of the duration of the data, that an output comes late at most")
     shown_periods: float = chosen(100.0, "of delay, at most: before a window, outputs are extrapolated")
     next_time: float = chosen(1.8, "times a time that is tried, at most, for the next one")

@@ -112,7 +112,7 @@ def _placeholders(config: EquationsConfig, e: Extension, where: str) -> Texts:
         known = dict(config.outputs) or {x: x for x in declarations.states(config)}
         _require(where, e.site, known)
         old = known[e.site]
-        return {"{y}": _bracketed(old.expr if isinstance(old, OutputConfig) else old)}
+        return {"{y}": _bracketed(old.expr if isinstance(old, OutputConfig) else old), **general}
     acts = (e.force, e.dry_friction, e.tilt, e.payload, e.implicit)
     if all(text is None for text in acts) and not e.forces and not e.memory:
         if e.frees is not None:

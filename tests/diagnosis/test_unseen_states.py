@@ -7,6 +7,9 @@ import pytest
 
 import gapcert as gc
 from gapcert.plugin import Recording, Trajectory
+from gapcert_diagnosis.data.dataset import Dataset
+from gapcert_diagnosis.fitting.hypothesis import Hypothesis
+from gapcert_diagnosis.testing import equations
 
 H, N = 0.005, 2400
 NUMBERS = {"J": {"value": "0.002 kg*m^2", "tolerance": "5 %"}, "b": "0.004 N*m*s/rad", "k": "0.08 N*m/A"}
@@ -58,3 +61,19 @@ def test_friction_is_found_without_the_angle(measured, form):
     told = [a for a in found.assumptions if "were not tried" in a]
     assert bool(told) == (form != "alone")
     assert all("dahl-friction" in a and "as no output shows how it moves" in a for a in told)
+
+
+def test_where_no_state_is_shown_windows_begin_where_the_model_gets_to():
+    """At rest a tension has no slope in the angle: from there no fit would find out which way a pendulum swings."""
+    section = {"kind": "equations", "states": {"q": "rad", "w": "rad/s"}, "inputs": {"T": "N*m"}, "period": "20 ms"}
+    section |= {"parameters": {"m": "0.8 kg", "l": "0.6 m", "d": "0.3 N*m*s/rad", "g": "9.81 m/s^2"}, "integrator": "rk4"}
+    section |= {"derivative": {"q": "w", "w": "(T - d*w - m*g*l*sin(q))/(m*l**2)"}, "outputs": {"S": "m*g*cos(q) + m*l*w**2"}}
+    model, t = equations(section), 0.02 * np.arange(400)
+    torque = 2.5 * np.sin(3.1 * t)[:, None]
+    x = model.fast_rollout(np.zeros((1, 2)), torque[None, :-1]).x[0]
+    tension = model.output(x, torque)[:, 0] + 0.01 * np.random.default_rng(0).normal(size=len(t))
+    log = Recording((Trajectory(t, {"S": tension, "T": torque[:, 0]}, "log"),), {}, "zero")
+    windows = Dataset.of(model, log).windows(50)
+    assert not windows.start.any()
+    found = Hypothesis(model).guessed(windows, np.empty(0), windows.start)
+    np.testing.assert_allclose(found, x[windows.place[:, 1]], atol=1e-9)

@@ -61,7 +61,7 @@ def lagged(u, seconds, h):
     return out
 
 
-def told(plant, u, way, shown=1.0):
+def told(plant, u, way, shown=1.0, effects="all"):
     """The diagnosis of a plant which the input u (T,) reaches by way(fine input, fine step)."""
     section, slope, rest = plant
     model = equations({"kind": "equations", "integrator": "rk4", **section})
@@ -76,7 +76,7 @@ def told(plant, u, way, shown=1.0):
     y = y + 0.004 * np.std(y) * np.random.default_rng(0).standard_normal(len(y))
     names = model.outputs[0].name, model.inputs[0].name
     recording = gc.Recording.of(np.arange(len(u)) * model.period, dict(zip(names, (y, u), strict=True)), hold="zero")
-    return diagnose(model, recording)
+    return diagnose(model, recording, effects)
 
 
 def only(found, name):
@@ -93,6 +93,27 @@ def test_an_oven_may_be_late_by_minutes(name, number):
     assert only(found, name) == {number: pytest.approx(80, rel=0.05)}
 
 
+def rated(u, h, rate, reached=0.0):
+    out = np.empty_like(u)
+    for k, level in enumerate(u):
+        moved = np.clip(level - reached, -rate * h, rate * h)
+        out[k], reached = reached + moved / 2, reached + moved
+    return out
+
+
+@pytest.mark.exam
+def test_what_acts_at_the_first_samples_only_is_not_nothing():
+    """A condenser is switched on, and its amplifier reaches the command within 30 ms; later none is as fast."""
+    section = {"states": {"v": "V"}, "inputs": {"u": "V"}, "period": "1 ms", "derivative": {"v": "(u - v)/T"}}
+    section |= {"parameters": {"T": {"value": "8.1 ms", "tolerance": "3 %"}}}
+    t, circuit = 0.001 * np.arange(900), (section, lambda x, u: np.array([(u - x[0]) / 0.008]), 0.0)
+    u = 3 * np.cos(21 * t) + np.sin(34 * t + 0.3)
+    some = ["input-rate-limit", "input-saturation", "parameter"]
+    found = only(told(circuit, u, lambda u, h: rated(u, h, 110.0), effects=some), "input-rate-limit")
+    assert found == {"rate": pytest.approx(110, rel=0.03)}
+    assert told(circuit, u, lambda u, h: u, effects=some).verdict == "nothing"
+
+
 @pytest.mark.parametrize(
     ("name", "number", "held"),
     [("input-lag", 90.0, None), ("input-rate-limit", 0.06, None), ("input-lag", 90.0, 8.0), ("input-delay", 22.0, 3.0)],
@@ -100,18 +121,11 @@ def test_an_oven_may_be_late_by_minutes(name, number):
 def test_a_log_may_begin_at_an_input_that_was_held(name, number, held):
     """At its first input, or at another one that nothing in the log shows."""
 
-    def rated(u, before, h):
-        out, reached = np.empty_like(u), before
-        for k, level in enumerate(u):
-            moved = np.clip(level - reached, -number * h, number * h)
-            out[k], reached = reached + moved / 2, reached + moved
-        return out
-
     def late(u, h):
         before = u[0] if held is None else held
         if name == "input-delay":
             return delayed(np.concatenate([[before], u]), number, h)[1:]
-        return rated(u, before, h) if name == "input-rate-limit" else before + lagged(u - before, number, h)
+        return rated(u, h, number, before) if name == "input-rate-limit" else before + lagged(u - before, number, h)
 
     u = 6 + 5 * commands(600, 30, 12)
     section, slope, _ = OVEN
@@ -257,3 +271,9 @@ def test_a_sensor_may_show_millimetres():
     (cause,) = told(CART, 5 * commands(1200, 60, 12), lambda u, h: u, 1000.0).causes
     assert cause.effect in ("sensor-scale", "input-gain")
     assert cause.unit_slip == "1000"
+
+
+def test_a_thermometer_may_show_thousands_of_kelvin():
+    """From there to 300 K no slope leads, and a heat that is not there would make up for some of it."""
+    (cause,) = told(OVEN, 9 * commands(600, 50, 13, low=0.0), lambda u, h: u, 0.001).causes
+    assert (cause.effect, cause.unit_slip) == ("sensor-scale", "1000")

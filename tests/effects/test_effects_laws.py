@@ -75,6 +75,18 @@ def test_a_lag_of_no_time_is_none():
     assert np.array_equal(driven(FREE, "input-lag", "u", LEVELS, time_constant=0.0), plain)
 
 
+@pytest.mark.parametrize("time", [0.0, 1e-4, 0.01, 0.3])
+def test_a_slow_sensor_follows_straight_lines_exactly(time):
+    model, left = with_effect(FREE, "sensor-lag", "q", time_constant=time), math.exp(-0.01 / time) if time else 0.0
+    x, z, hidden = np.array([[0.3]]), 0.3, np.zeros((1, 2))
+    for u in LEVELS:
+        moved = model.fast_rollout(x, np.array([[[u]]]), hidden=hidden)
+        # Towards a line of slope u, which it is behind by T·u in the end.
+        z = moved.x[0, -1, 0] - u * time + (z - x[0, 0] + u * time) * left
+        x, hidden = moved.x[:, -1], moved.hidden
+        assert model.output(x, np.zeros((1, 1)), None, hidden)[0, 0] == pytest.approx(z, abs=1e-12)
+
+
 def servo(u, rate, time, fine=2000):
     """q under q̇ = r, ṙ = clip((u − r)/time, ±rate), by fine steps of the trapezoid."""
     r, total, h = 0.0, [0.0], 0.01 / fine

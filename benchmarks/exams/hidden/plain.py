@@ -21,7 +21,7 @@ compiled = compiler(error_model="numpy")
 
 VISCOUS, QUADRATIC, DRY, CONSTANT, PUSH, WHEN, LONG = range(7)
 GAIN, OFFSET, MINUS, PLUS, HARD, SOFT, DELAY, LAG, RATE, SAG, SAG_TIME = range(11)
-SCALE, BIAS, LATE = range(3)
+SCALE, BIAS, LATE, SLOW = range(4)
 WINDOW, RUN = 1, 2  # what begins at a sample: a rollout, or a run with all its memories
 STEPS = 12  # in the fastest time constant, and in a sample, at least
 
@@ -139,6 +139,7 @@ def simulate(
     X, Y, fine = np.zeros((count, n)), np.zeros((count, ny)), np.zeros((count * sub, ny))
     x, z, d, kept = np.zeros(n), np.zeros(n), np.zeros((4, n)), np.zeros(3)
     memory, first, begun, total, last = np.zeros(3), 0, 0, 0.0, 0.0
+    here, there = np.zeros(ny), np.zeros(ny)
     for k in range(count):
         if begins[k] > 0:
             x[:] = starts[begun]
@@ -151,7 +152,13 @@ def simulate(
             now = k * sub + j
             held = commanded(u, first, sub, now - W[DELAY] / h, straight, law[3])
             kept[:] = memory
-            output(number, p, x, path(W, kept, held, 1e-9 * h), fine[now])
+            output(number, p, x, path(W, kept, held, 1e-9 * h), here)
+            for i in range(ny):
+                fine[now, i] = here[i]
+                if S[i, SLOW] > 0 and now > first * sub:
+                    left = math.exp(-h / S[i, SLOW])
+                    fine[now, i] = left * fine[now - 1, i] + (1 - left) * (here[i] + there[i]) / 2
+            there[:] = here
             if j == 0:
                 for i in range(ny):
                     at = max(now - S[i, LATE] / h, float(first * sub))
@@ -524,12 +531,17 @@ _INPUTS = {
     "input-rate-limit": {"rate": RATE},
     "supply-sag": {"sag": SAG, "time_constant": SAG_TIME},
 }
-_OUTPUTS = {"sensor-scale": {"scale": SCALE}, "sensor-bias": {"bias": BIAS}, "sensor-delay": {"delay": LATE}}
+_OUTPUTS = {
+    "sensor-scale": {"scale": SCALE},
+    "sensor-bias": {"bias": BIAS},
+    "sensor-delay": {"delay": LATE},
+    "sensor-lag": {"time_constant": SLOW},
+}
 
 
 def tables(plant: Plant, p: Array, effects: Sequence[Hidden]) -> tuple[Array, Array, Array, Array]:
     """(parameters, forces, input path, outputs) with the effects in them; KeyError where one is not known here."""
-    p, F, W, S = p.copy(), np.zeros((len(plant.states), 7)), np.zeros(11), np.zeros((len(plant.shown), 3))
+    p, F, W, S = p.copy(), np.zeros((len(plant.states), 7)), np.zeros(11), np.zeros((len(plant.shown), 4))
     W[GAIN] = S[:, SCALE] = 1.0
     for h in effects:
         numbers = {"minus": h.numbers["width"], "plus": h.numbers["width"]} if "width" in h.numbers else dict(h.numbers)

@@ -31,7 +31,7 @@ class Dataset:
     the recording does not say (treated as zero); drives: hold → per trajectory (T·repeat, nu), the mean input over each model
     period; source: the recording's trajectory that each of these is a piece of; log: what was found and repaired;
     since: per trajectory of the recording, the time from which windows may begin, in s (all of it where empty); rough (ny,): by
-    how much at most what is seen in the values alone moves them (not at all where empty).
+    how much at most what is seen in the values alone moves them (not at all where empty); whole: do windows begin at once?
     """
 
     channels: tuple[StateSpec, ...]
@@ -52,6 +52,7 @@ class Dataset:
     log: Mapping[str, Any] = field(default_factory=dict)
     since: tuple[float, ...] = ()
     rough: Array = field(default_factory=lambda: np.empty(0))
+    whole: bool = False
 
     @classmethod
     def of(cls, model: Model, recording: Recording) -> Dataset:
@@ -115,7 +116,7 @@ class Dataset:
     @property
     def history(self) -> int:
         """Samples of input kept before every window."""
-        return math.ceil(THRESHOLDS.input_history / self.period - 1e-6)
+        return 1 if self.whole else math.ceil(THRESHOLDS.input_history / self.period - 1e-6)
 
     @property
     def past(self) -> int:

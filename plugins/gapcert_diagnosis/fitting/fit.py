@@ -116,7 +116,7 @@ def fit(
     """
     theta = np.clip(h.value if theta is None else theta, h.low, h.high)
     part = _leaning(h, windows, theta)
-    here = _linearise(h, part, theta, windows.start if start is None else start)
+    here = _linearise(h, part, theta, h.guessed(windows, theta, windows.start) if start is None else start)
     if not _followable(here.residual):
         theta = np.clip(h.value, h.low, h.high)
         part = _leaning(h, windows, theta)
@@ -184,7 +184,9 @@ def followed(h: Hypothesis, theta: Array, windows: Windows, start: Array | None 
 
     start: of another fit of these windows; each window begins from there, where that is nearer than what was measured.
     """
-    fixed, starts = h.holding(theta), windows.start[None] if start is None else np.stack([windows.start, start])
+    fixed = h.holding(theta)
+    own = fixed.guessed(windows, np.empty(0), windows.start)
+    starts = own[None] if start is None else np.stack([own, start])
     r = _residual(fixed, windows, np.empty((len(starts), 0)), starts)
     with np.errstate(all="ignore"):
         left = np.nan_to_num(np.sum(r**2, axis=(2, 3)), nan=np.inf)

@@ -117,6 +117,38 @@ class Hypothesis:
         start = start.reshape(len(theta) * w, -1)
         return self.model.fast_rollout(start, u, parameters=self._values(theta, w), hidden=hidden, every=every).x
 
+    def guessed(self, windows: Windows, theta: Array, start: Array) -> Array:
+        """Starts (W, nx) in which states that sensors scale or shift are where these show what was measured.
+
+        Where no channel shows any state, those of the model from rest, which a machine forgets.
+        """
+        if not any(map(np.any, windows.measured.states)):
+            return self._played(windows, theta, start)
+        if self._shows_states():
+            return start
+        m, names, start = windows.measured, [s.name for s in self.model.states], start.copy()
+        u, values = windows.u[:, m.history], self._values(theta[None], len(windows))
+        for channel, column in zip(m.channels, m.columns, strict=True):
+            if channel.name in names:
+                own = np.arange(len(names)) == names.index(channel.name)
+                x, width = np.where(own, windows.start, start), nudges(start)
+                y, moved = (self.model.output(z, u, values)[:, column] for z in (x, x + width * own))
+                with np.errstate(all="ignore"):
+                    off = (y - x[:, own][:, 0]) * width[own] / (moved - y)
+                sensed = np.isfinite(off) & (np.abs(off) > 1e-9 * np.abs(y))
+                start[sensed] = np.where(own, x[sensed] - off[sensed, None], start[sensed])
+        return start
+
+    def _played(self, windows: Windows, theta: Array, start: Array) -> Array:
+        m, values, start = windows.measured, self._values(theta[None], 1), start.copy()
+        for piece in np.unique(windows.place[:, 0]).tolist():
+            rows, u = windows.place[:, 0] == piece, m.driven[piece][None]
+            with np.errstate(all="ignore"):
+                x = self.model.fast_rollout(np.zeros((1, self.model.nx)), u, parameters=values, every=m.repeat).x[0]
+            if np.isfinite(x).all():
+                start[rows] = x[windows.place[rows, 1]]
+        return start
+
     def led(self, windows: Windows, theta: Array, start: Array, rows: npt.NDArray[np.bool_]) -> Windows:
         """Windows whose history begins, in these rows, with the state (nx,) that leads to their start: Newton's shooting.
 

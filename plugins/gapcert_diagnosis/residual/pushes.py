@@ -18,7 +18,7 @@ from scipy.stats import binom
 
 from gapcert.plugin import Bools, Effect, Model, position, site_units
 from gapcert_diagnosis.data.dataset import Dataset
-from gapcert_diagnosis.fitting.fit import Fit, fit, followed, rescued
+from gapcert_diagnosis.fitting.fit import Fit, fit, followed, lag_one, rescued
 from gapcert_diagnosis.fitting.hypothesis import Hypothesis
 from gapcert_diagnosis.fitting.linearised import Tangent
 from gapcert_diagnosis.results import Push
@@ -155,7 +155,9 @@ def _strongest(model: Model, last: Fit, measured: Dataset, length: int) -> Itera
     most = np.stack([g[row, k] for g, k in zip(gain, best, strict=True)], axis=-1)
     gains = most.max(axis=1)
     rest = max(1.0, float(np.median((energy - gains) / np.maximum(np.sum(windows.weight**2, axis=(1, 2)), 1))))
-    chance = THRESHOLDS.push_beyond * rest * charge(len(sites) * len(first) * len(row))
+    rho = max(0.0, float(np.median([lag_one(r[None]).max() for r in motion.residual.reshape(windows.y.shape)])))
+    # Neighbours that are alike are fewer, and their sum is larger.
+    chance = THRESHOLDS.push_beyond * rest * (1 + rho) / (1 - rho) * charge(len(sites) * len(first) * len(row))
     plain = gains > THRESHOLDS.push_share * (energy - np.median(energy))
     # What moves outputs by less than 1.5 noise floors from its beginning on, or is little force, may be an integrator's.
     best_site = most.argmax(axis=1)

@@ -263,12 +263,9 @@ def unit_slip(library: Library, c: Candidate, fitted: Fit) -> str | None:
     if not library.is_factor(c):
         return None
     value, half = fitted.estimates()[library.names(c)[0]]
-    for units, factor in THRESHOLDS.unit_slips:
-        for slip in (factor, 1 / factor):
-            off = abs(abs(value) - slip) / slip
-            if off < THRESHOLDS.near_slip and off * slip < max(half, THRESHOLDS.sure_slip * slip):
-                return units
-    return None
+    slips = [(abs(abs(value) / slip - 1), slip, units) for units, f in THRESHOLDS.unit_slips for slip in (f, 1 / f)]
+    off, slip, units = min(slips)
+    return units if off < THRESHOLDS.near_slip and off * slip < max(half, THRESHOLDS.sure_slip * slip) else None
 
 
 def flags(library: Library, c: Candidate, fitted: Fit) -> tuple[str, ...]:

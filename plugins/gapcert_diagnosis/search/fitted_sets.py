@@ -175,7 +175,8 @@ class FittedSets:
         """A set with a move more, fitted to the short windows from what is promised."""
         h, brief = self.library.hypothesis((*base[0], *s.move)), self.brief(base)
         theta = h.theta(brief.values | dict(s.values))
-        return fit(h, self.short, theta=theta, start=brief.start, iterations=iterations)
+        start = h.guessed(self.short, theta, brief.start)
+        return fit(h, self.short, theta=theta, start=start, iterations=iterations)
 
     def fit_further(self, first: Fit, iterations: int = THRESHOLDS.second_fit) -> Fit:
         """A fit to the short windows, gone on with."""

@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from gapcert_diagnosis.fitting.fit import Fit, promising
+from gapcert_diagnosis.fitting.fit import Fit, followed, promising
 from gapcert_diagnosis.thresholds import THRESHOLDS
 
 from .candidates import Candidate, Causes, Library
@@ -43,7 +43,7 @@ def additions(
     if max((p[0].gain for p in (short, long) if p), default=-math.inf) < least:
         return []
     few = {keys(s.move): s for s in plain([*long[: THRESHOLDS.long_fits], *short[: THRESHOLDS.short_fits]], library)}
-    blind = [s for s in stuck(sets, causes, few) if allowed(s.move)]
+    blind = [s for s in (*stuck(sets, causes, few), *slipped(sets, causes)) if allowed(s.move)]
     picks, known = [*few.values(), *blind], None if instead is None else sets.known((*causes, instead))
     if instead is None or known is None:
         tried = [(s, sets.try_move(base, s)) for s in picks]
@@ -138,6 +138,20 @@ def stuck(sets: FittedSets, causes: Causes, but: Collection[Keys]) -> list[Promi
         thetas = [h.theta(brief.values | dict(zip(names, row, strict=True))) for row in starts.tolist()]
         theta = promising(h, sets.short, np.array(thetas), brief.start)[0]
         out.append(Promise((c,), {n: float(theta[h.names.index(n)]) for n in names}, 0.0))
+    return out
+
+
+def slipped(sets: FittedSets, causes: Causes) -> list[Promise]:
+    """Sensors in another unit, where nothing is followed: a start that is a thousandfold off shows a screen no scale."""
+    if causes or sets.nothing.chi.max() < THRESHOLDS.coarse_residual:
+        return []
+    out = []
+    for c in (c for c in sets.library.candidates if c.effect.site == "output" and sets.library.is_factor(c)):
+        h, (name,) = sets.library.hypothesis((c,)), sets.library.names(c)
+        factors = [f for _, one in THRESHOLDS.unit_slips for f in (one, 1 / one)]
+        left = [float(followed(h, h.theta({name: f}), sets.short).chi.max()) for f in factors]
+        if min(left) < sets.brief(((), sets.nothing)).chi.max():
+            out.append(Promise((c,), {name: factors[int(np.argmin(left))]}, 0.0))
     return out
 
 
