@@ -246,25 +246,36 @@ def recalled(model: Model, windows: Windows, parameters: Mapping[str, Array | fl
     A lag, a play or a sagging supply knows more of the past than the history before a window tells.
     """
     out = _defaults(model, count, windows.t - windows.measured.history * windows.measured.period)
-    if model.remembers:
+    if len(model.hidden) > ("time" in {s.name for s in model.hidden}):
         if windows not in _WAYS:
             first = windows.place[:, 1] - windows.measured.history
             rows = {piece: np.flatnonzero(windows.place[:, 0] == piece) for piece in np.unique(windows.place[:, 0]).tolist()}
             _WAYS[windows] = _Way(windows.measured, rows, {p: first[r] for p, r in rows.items()})
-        for piece, hidden in _Past(model, _WAYS[windows], parameters, count).found().items():
+        past = _Past(model, _WAYS[windows], parameters, count)
+        for piece, hidden in past.found().items() if model.remembers else ():
             out[:, _WAYS[windows].rows[piece]] = hidden
-    _commanded(model, windows, out)
+        _commanded(model, windows, past, out)
     return out.reshape(count * len(windows), -1)
 
 
-def _commanded(model: Model, windows: Windows, out: Array) -> None:
-    """Late inputs among hidden states (count, W, nh), as they were commanded; before a recording its first input acted."""
-    m, inputs, names = windows.measured, [s.name for s in model.inputs], [s.name for s in model.hidden]
-    for i, name in enumerate(inputs):
-        late = [j for j, n in enumerate(names) if n.rpartition("_")[0] == f"{name}_delay"]
-        back = np.array([int(names[j].rpartition("_")[2]) for j in late], dtype=int)
-        for w, (piece, first) in enumerate(windows.place.tolist() if late else ()):
-            out[:, w, late] = m.driven[piece][np.maximum((first - m.history) * m.repeat - back, 0), i]
+def _commanded(model: Model, windows: Windows, past: _Past, out: Array) -> None:
+    """Late inputs among hidden states (count, W, nh), as they were commanded."""
+    m = windows.measured
+    for i, late in _late(model).items():
+        back = np.array([int(model.hidden[j].name.rpartition("_")[2]) for j in late])
+        for w, (piece, first) in enumerate(windows.place.tolist()):
+            at = (first - m.history) * m.repeat - back
+            out[:, w, late] = m.driven[piece][np.maximum(at, 0), i]
+            if at.min() < 0:
+                begun = past.start[:, past.way.pieces.index(piece), late]
+                out[:, w, late] = np.where(at < 0, begun, out[:, w, late])
+
+
+def _late(model: Model) -> dict[int, list[int]]:
+    """Which hidden states are an input's past, by the inputs that have one."""
+    names = [s.name.rpartition("_")[0] for s in model.hidden]
+    found = {i: [j for j, n in enumerate(names) if n == f"{s.name}_delay"] for i, s in enumerate(model.inputs)}
+    return {i: late for i, late in found.items() if late}
 
 
 def _defaults(model: Model, count: int, t: Array) -> Array:
@@ -343,29 +354,65 @@ class _Past:
 
     @cached_property
     def start(self) -> Array:
-        """Hidden states (count, pieces, nh) at the first sample: nothing acted before a recording, or its first input did.
+        """Hidden states (count, pieces, nh) at the first sample: before a recording nothing acted, or its first input did, or
+        what holds its first state at rest.
 
         A machine that is just switched on, or at an operating point: the first samples tell.
         """
         u, first = self.way.path[1], [self.way.measured.times[p][0] for p in self.way.pieces]
         hidden = _defaults(self.model, self.count, np.array(first))
-        if not u[:, 0].any():
+        begun = np.tile(u[:, 0], (self.count, 1, 1))
+        levels = [v for v in (begun, self._resting(begun)) if v is not None and v.any()]
+        if not levels:
             return hidden
-        settled, plain = self._settled(u[:, :1], hidden), self._settled(0 * u[:, :1], hidden)
-        # What moves without an input is bent by the motion, which was another one before.
-        settled = np.where(np.isfinite(settled) & (plain == hidden), settled, hidden)
-        held = self._missed(settled) < self._missed(hidden)
-        return np.where(held[..., None], settled, hidden)
+        plain = self._settled(0 * begun, hidden)
+        own = plain == hidden  # what moves without an input is bent by the motion, which was another one before
+        for i, late in _late(self.model).items():
+            hidden[..., late] = begun[..., i, None]
+        best, least = hidden, self._missed(hidden)
+        for settled in (*(self._settled(level, hidden) for level in levels), plain):
+            settled = np.where(np.isfinite(settled) & own, settled, hidden)
+            missed = self._missed(settled)
+            best, least = np.where((missed < least)[..., None], settled, best), np.minimum(missed, least)
+        return best
+
+    def _resting(self, u: Array) -> Array | None:
+        """Inputs (count, pieces, nu) that hold the first states at rest, to first order; u: the first ones.
+
+        None where states are not known, or where no input but these or none does.
+        """
+        m, model = self.way.measured, self.model
+        if self.way.blind.any() or not model.nu:
+            return None
+        loose = {p.name for p in model.parameters if p.tolerance > 0}
+        rows = {n: v for n, v in self._rows(u.shape[1]).items() if n in loose}
+        x, size = np.tile([m.states[p][0] for p in self.way.pieces], (self.count, 1)), np.std(np.concatenate(m.inputs), axis=0)
+        spread, size = np.maximum(np.std(np.concatenate(m.states), axis=0), 1e-300), np.maximum(size, 1e-300)
+
+        def off(by: Array) -> Array:
+            return difference(model.states, model.step(x, flat(u) + by, parameters=rows).x, x) / spread
+
+        with np.errstate(all="ignore"):
+            here = off(np.zeros(model.nu))
+            slope = np.nan_to_num(np.stack([off(d) - here for d in np.diag(size)], axis=-1))
+            moved = (np.linalg.pinv(slope) @ np.nan_to_num(here)[..., None])[..., 0].reshape(u.shape) * size
+        new = np.minimum(np.abs(u - moved), np.abs(moved)) > THRESHOLDS.other_level * size
+        return np.asarray(u - moved) if new.any() else None
 
     def _settled(self, u: Array, hidden: Array) -> Array:
-        """What is remembered where the first state, and inputs (pieces, 1, nu), have been held for as long as the log is."""
-        long, path = max(len(self.way.measured.driven[p]) for p in self.way.pieces), self.way.path[0][:, :1]
-        (x, drive), rows, given = (np.repeat(a, long, axis=1) for a in (path, u)), self._rows(len(path)), flat(hidden)
-        found = self.model.fast_memories(x, drive, [long - 1], rows, given)
-        if found is None:
-            begun = np.tile(np.nan_to_num(path[:, 0]), (self.count, 1))
-            found = self.model.fast_rollout(begun, drive, parameters=rows, hidden=given, every=long).hidden
-        return hidden if found is None else found.reshape(hidden.shape)
+        """What is remembered where first states, and inputs (count, pieces, nu), have been held for as long as the log is."""
+        out = hidden.copy()
+        if self.model.remembers:
+            long, first = max(len(self.way.measured.driven[p]) for p in self.way.pieces), self.way.path[0][:, 0]
+            x, drive = (np.repeat(a[:, None], long, axis=1) for a in (np.tile(first, (self.count, 1)), flat(u)))
+            rows, given = self._rows(len(first)), flat(hidden)
+            found = self.model.fast_memories(x, drive, [long - 1], rows, given)
+            if found is None:
+                found = self.model.fast_rollout(np.nan_to_num(x[:, 0]), drive, parameters=rows, hidden=given, every=long).hidden
+            out = out if found is None else found.reshape(hidden.shape)
+        for i, late in _late(self.model).items():
+            out[..., late] = u[..., i, None]
+        return out
 
     def _missed(self, hidden: Array) -> Array:
         """Squares (count, pieces) by which the first samples are missed from there on, in spreads of the states."""
