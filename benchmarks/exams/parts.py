@@ -84,6 +84,7 @@ def pairs(records: Sequence[Record]) -> list[Figure]:
     spare = sum(map(score.extra, records)) / max(len(records), 1)
     return [
         least("both named", score.rate(records, score.both), 0.9),
+        least("both named, or what fits as well with as few causes and numbers", score.rate(records, score.both_or_as_well)),
         Figure("names beyond the two, per answer", "names", spare),
     ]
 

@@ -101,6 +101,13 @@ def both(r: Record) -> bool:
     return all(said & {(k[0], k[1]) for k in c} for c in r["classes"])
 
 
+def both_or_as_well(r: Record) -> bool:
+    """Or do as few causes and numbers fit the noiseless data as well as the truth?"""
+    few = [sum(len(h["numbers"].keys() - {"soft"}) for h in r.get(side, [])) for side in ("causes", "hidden")]
+    as_well = r.get("stands") and r["verdict"] in NAMED and len(r["causes"]) <= len(r["hidden"]) and few[0] <= few[1]
+    return both(r) or bool(as_well)
+
+
 def extra(r: Record) -> int:
     known = {(k[0], k[1]) for c in r["classes"] for k in c}
     return len(set(named(r)) - known)

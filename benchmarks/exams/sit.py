@@ -123,11 +123,12 @@ def judged(case: Case, record: Record) -> Record:
 
 
 def without(keys: Sequence[Sequence[str]]) -> list[str]:
-    """The library without some effects, and without everything that contains one of them."""
+    """The library without some effects, and without everything that contains one of them, or has a form that does."""
     known = gc.registry()
     library = {name: known.build("effect", name) for name in known.names("effect")}
     gone = {k[0] for k in keys}
-    while more := {n for n, e in library.items() if n not in gone and gone & set(e.contains)}:
+    inside = {n: {k for form in (e, *e.variants) for k in form.contains} for n, e in library.items()}
+    while more := {n for n in library if n not in gone and gone & inside[n]}:
         gone |= more
     return [n for n in library if n not in gone]
 

@@ -305,6 +305,8 @@ class Thresholds:
     richer_fall: float = chosen(8.0, "of the squared residual, that a richer law must promise")
     paired_short_fits: int = chosen(6, "of the largest promise on long and on short windows")
     paired_full_fits: int = chosen(2, "of these")
+    table_numbers: int = chosen(3, "of a law, from which it may bend to anything")
+    split_parts: int = chosen(2, "laws within such a one, and as many of what may be beside each")
     paired_share: float = chosen(0.6, "of what was found, below which no pair promises to explain as much")
     screened_samples: int = decides(5_000, "at most: more windows say nothing new about which candidates to try")
     finer_scan: int = chosen(7, "points of a local scan: optima in a quantum or a frequency are needles")

@@ -389,9 +389,9 @@ class SupplySag(Law):
     rivals: ClassVar = {"input-gain": LEVELS, "input-saturation": SMALL_AND_LARGE, "input-lag": FAST}
 
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
-        """Also time constants of a log's own length: of those that are longer, it shows no more than a decline."""
+        """Also time constants of a few samples, and of a log's own length: longer ones show no more than a decline."""
         sag, time_constant = self.parameters
-        times = {*time_constant.starts, *(s * scales["duration"] for s in (0.2, 0.7))}
+        times = {*time_constant.starts, *(s * scales["period"] for s in (5, 20)), *(s * scales["duration"] for s in (0.2, 0.7))}
         low, high = time_constant.bounds(scales)
         return [(s * sag.scale(scales), t) for s in sag.starts for t in sorted(times) if low < t < high]
 

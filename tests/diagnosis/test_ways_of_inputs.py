@@ -133,6 +133,45 @@ def test_a_log_may_begin_at_an_input_that_was_held(name, number, held):
     assert list(found.values()) == [pytest.approx(number, rel=0.05)]
 
 
+def test_a_log_may_begin_at_rest_under_an_input_that_it_does_not_show():
+    """The heat that holds the first temperature acted before, and not the first one that is logged."""
+    u, before = 5 + 4 * commands(500, 30, 4), 5.0
+    section, slope, _ = OVEN
+
+    def late(u, h):
+        gone = round(120.0 / h)
+        return np.concatenate([np.full(gone, before), u])[: len(u)]
+
+    found = told((section, slope, 290 + before / 0.0525), u, late)
+    assert abs(u[0] - before) > 0.4
+    assert only(found, "input-delay") == {"delay": pytest.approx(120.0, rel=0.02)}
+
+
+@pytest.mark.exam
+@pytest.mark.parametrize("second", ["input-delay", "input-rate-limit"])
+def test_what_a_lag_blunts_is_found_behind_it(second):
+    def limited(u, h):
+        out, reached = np.empty_like(u), 0.0
+        for k, level in enumerate(u):
+            moved = np.clip(level - reached, -4 * h, 4 * h)
+            out[k], reached = reached + moved / 2, reached + moved
+        return out
+
+    def way(u, h):
+        return lagged(limited(u, h) if second == "input-rate-limit" else delayed(u, 0.21, h), 0.4, h)
+
+    found = told(VALVE, commands(1200, 25, 5), way)
+    assert {c.effect for c in found.causes} == {"input-lag", second}
+
+
+def test_a_curve_is_no_answer_where_two_plain_laws_are():
+    def way(u, h):
+        return 0.7 * np.tanh((u - np.clip(u, -0.03, 0.08)) / 0.7)
+
+    found = told(VALVE, commands(700, 25, 9), way)
+    assert {c.effect for c in found.causes} == {"input-dead-zone", "input-saturation"}
+
+
 def test_two_lags_are_one_of_second_order():
     found = only(told(VALVE, commands(1500, 25, 2), lambda u, h: lagged(lagged(u, 0.3, h), 0.17, h)), "input-lag")
     assert found == {"time_constant": pytest.approx(0.3, rel=0.1), "second": pytest.approx(0.17, rel=0.15)}

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from exams import plain, play, score, store
+from exams import plain, play, score, sit, store
 from exams.hidden.laws import Hidden
 from exams.hidden.plain import NAMES, RUN, plant
 
@@ -171,6 +171,26 @@ def test_an_experiment_has_resolved_what_it_promised_to_and_no_more():
     assert score.resolved(asked)
     assert not score.resolved(asked | {"apart": [{"rival": ["b", "q"]}, {"rival": ["c", "q"]}]})
     assert not score.resolved(asked | {"hidden": [{"effect": "b", "site": "q"}]})
+
+
+def test_what_has_a_form_that_contains_a_hidden_effect_is_taken_out_with_it():
+    rest = sit.without([["input-gain", "u"]])
+    assert not {"input-gain", "input-nonlinearity"} & set(rest)
+    assert {"input-dead-zone", "sensor-scale"} <= set(rest)
+
+
+def test_of_a_pair_what_fits_as_well_with_as_few_numbers_may_be_named():
+    hidden = [
+        {"effect": "a", "site": "u", "numbers": {"level": 1.0, "soft": 1.0}},
+        {"effect": "b", "site": "u", "numbers": {"w": 2.0}},
+    ]
+    said = [{"effect": n, "site": "u", "numbers": {"k": 1.0}} for n in ("a", "c")]
+    r = {"hidden": hidden, "causes": said, "classes": [[["a", "u"]], [["b", "u"]]], "verdict": "causes", "stands": True}
+    assert score.both_or_as_well(r)
+    assert not score.both(r)
+    assert not score.both_or_as_well(r | {"stands": False})
+    assert not score.both_or_as_well(r | {"causes": [*said, said[1] | {"effect": "d"}]})
+    assert not score.both_or_as_well(r | {"causes": [said[0], said[1] | {"numbers": {"k": 1.0, "l": 1.0}}]})
 
 
 @pytest.mark.exam

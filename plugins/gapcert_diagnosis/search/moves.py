@@ -40,9 +40,11 @@ def additions(
         return rank([f for f in sets.added[keys(causes)] if allowed(without(f[0], causes))], sets.cautious)
     short, long = (worth([s for s in p if allowed(s.move)], p, instead) for p in sets.promises(base, instead))
     least = hope + 2 * math.log(max(1, len(library.candidates)))
-    if max((p[0].gain for p in (short, long) if p), default=-math.inf) < least:
+    behind = [s for s in blunted(sets, base) if allowed(s.move)]
+    if not behind and max((p[0].gain for p in (short, long) if p), default=-math.inf) < least:
         return []
     few = {keys(s.move): s for s in plain([*long[: THRESHOLDS.long_fits], *short[: THRESHOLDS.short_fits]], library)}
+    few |= {keys(s.move): s for s in behind}
     blind = [s for s in (*stuck(sets, causes, few), *slipped(sets, causes)) if allowed(s.move)]
     picks, known = [*few.values(), *blind], None if instead is None else sets.known((*causes, instead))
     if instead is None or known is None:
@@ -131,10 +133,27 @@ def stuck(sets: FittedSets, causes: Causes, but: Collection[Keys]) -> list[Promi
     """Dry friction at every coordinate but those tried already: one that sticks shows a screen neither speed nor force."""
     if causes:
         return []
-    library, brief, out = sets.library, sets.brief(((), sets.nothing)), []
-    dry = [c for c in library.candidates if len(library.dry((c,))) == 1 == len(c.effect.parameters)]
-    for c in (c for c in dry if keys((c,)) not in but):
-        h, names, starts = library.hypothesis((c,)), library.names(c), library.starts(c)
+    dry = [c for c in sets.library.candidates if len(sets.library.dry((c,))) == 1 == len(c.effect.parameters)]
+    return _unscreened(sets, ((), sets.nothing), [c for c in dry if keys((c,)) not in but])
+
+
+def blunted(sets: FittedSets, base: Found) -> list[Promise]:
+    """What else remembers on the way of an input where something does already: that blunts what a screen expects of it."""
+    library, (causes, now) = sets.library, base
+
+    def remembers(c: Candidate) -> bool:
+        e = library.extension(c)
+        return c.effect.site == "input" and bool(e.memory or e.delay)
+
+    sites = set() if noise(now) else {c.site for c in causes if remembers(c)}
+    return _unscreened(sets, base, [c for c in library.candidates if c.site in sites and remembers(c) and c not in causes])
+
+
+def _unscreened(sets: FittedSets, base: Found, candidates: Sequence[Candidate]) -> list[Promise]:
+    """Each beside a set, from the best of its first values."""
+    library, brief, out = sets.library, sets.brief(base), []
+    for c in candidates:
+        h, names, starts = library.hypothesis((*base[0], c)), library.names(c), library.starts(c)
         thetas = [h.theta(brief.values | dict(zip(names, row, strict=True))) for row in starts.tolist()]
         theta = promising(h, sets.short, np.array(thetas), brief.start)[0]
         out.append(Promise((c,), {n: float(theta[h.names.index(n)]) for n in names}, 0.0))

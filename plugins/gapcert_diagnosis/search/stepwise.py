@@ -101,7 +101,7 @@ class EquationSearch:
             first, best = self.refine(best), self.forward()
             most = max(1, len(first[0]) - len(best[0])) * sets.library.charge()
             best = first if sets.better(first[1], best[1]) > most and sets.matters(first) else best
-        return self.try_pairs(best)
+        return self.try_split(self.try_pairs(best))
 
     def forward(self) -> Found:
         """What single steps lead to; where that is no noise yet, or does not last, the best of what several at once lead to."""
@@ -179,6 +179,24 @@ class EquationSearch:
                 enough = sets.better(new[1], sets.nothing) > len(new[0]) * sets.library.charge()
                 if more and enough and sets.pays(new, nothing) and sets.matters(new):
                     best = new
+        return best
+
+    def try_split(self, found: Found) -> Found:
+        """What was found, or two plain laws in the place of one of many numbers: it can bend to what they are together."""
+        sets, library, best = self.sets, self.sets.library, found
+        for c in found[0]:
+            if len(c.effect.parameters) < (THRESHOLDS.table_numbers if noise(found[1]) else 2):
+                continue
+            rest = without(found[0], (c,))
+            plain = [(e, (*rest, e)) for e in library.candidates if library.within(e, c)]
+            parts = [(new, sets.fit(new, found, sets.carry(c, e, found))) for e, new in plain]
+            for part in rank(parts, sets.cautious)[: THRESHOLDS.split_parts]:
+                for grown in additions(sets, part)[: THRESHOLDS.split_parts]:
+                    new = self.refine(grown)
+                    more = library.simplicity(new[0])[0] - library.simplicity(best[0])[0]
+                    least = THRESHOLDS.tie_score if more >= 0 else 0.0
+                    if sets.better(new[1], best[1]) > least and sets.matters(new):
+                        best = new
         return best
 
     def _explained(self, fitted: Fit) -> float:
