@@ -124,7 +124,7 @@ class Hypothesis:
         """
         if not any(map(np.any, windows.measured.states)):
             return self._played(windows, theta, start)
-        if self._shows_states():
+        if shows_states(self.model):
             return start
         m, names, start = windows.measured, [s.name for s in self.model.states], start.copy()
         u, values = windows.u[:, m.history], self._values(theta[None], len(windows))
