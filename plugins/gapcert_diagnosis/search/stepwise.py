@@ -108,7 +108,8 @@ class EquationSearch:
         if not self.thorough and (few := self.try_piles()) is not None:
             return few
         best = forward(self)
-        if not best[0] or self.enough(best) or (best[1].chi.max() > THRESHOLDS.lost_search and not self.sets.cautious):
+        lost = len(best[0]) >= THRESHOLDS.most_moves and best[1].chi.max() > THRESHOLDS.lost_search
+        if not best[0] or self.enough(best) or (lost and not self.sets.cautious):
             return best
         small, large = sorted([best, forward(self, THRESHOLDS.beam, self.enough)], key=lambda f: len(f[0]))
         return large if self.outdoes(large, small) else small
