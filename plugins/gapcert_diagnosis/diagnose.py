@@ -486,8 +486,8 @@ def _listed(problem: DiagnosisProblem, data: Data, answer: Answer) -> tuple[Push
     whole = replace(whole, sigma=held.sigma, spread=held.spread, hold=answer.dataset.hold)
     names = [tr.name for tr in problem.recording.trajectories]
     law = registry().build("effect", PUSH)
-    if causes:
-        # Causes may stand in for pushes: where these leave noise without them, they are the answer.
+    if causes and np.median(answer.search.nothing.each.max(axis=1)) < THRESHOLDS.coarse_residual:
+        # Causes may stand in for pushes: where these leave noise without them, as in most windows, they are the answer.
         found = pushes(lambda values: data.library.extended((), values), answer.search.nothing, whole, names, law)
         between = data.windows.measured.between(_at(found, problem.fitted)) if found else None
         if between is not None and noise(fit(data.library.hypothesis(()), between.windows(data.windows.length))):

@@ -108,7 +108,7 @@ class EquationSearch:
         if not self.thorough and (few := self.try_piles()) is not None:
             return few
         best = forward(self)
-        if not best[0] or self.enough(best) or (best[1].chi.max() > THRESHOLDS.lost_search and not self.sets.cautious):
+        if not best[0] or self.enough(best) or (self.settled(best) and not self.sets.cautious):
             return best
         small, large = sorted([best, forward(self, THRESHOLDS.beam, self.enough)], key=lambda f: len(f[0]))
         return large if self.outdoes(large, small) else small
@@ -127,6 +127,11 @@ class EquationSearch:
 
     def outdoes(self, new: Found, best: Found) -> bool:
         return outdoes(new[1], best[1], *self.sets.charges(new, best), larger=len(new[0]) > len(best[0]))
+
+    def settled(self, best: Found) -> bool:
+        """Far from noise, is it a pile of causes, or next to nothing of what was missing? Of such, samples say no more."""
+        gone = float(best[1].chi.sum()) < THRESHOLDS.settled_share * float(self.sets.nothing.chi.sum())
+        return best[1].chi.max() > THRESHOLDS.lost_search and (gone or len(best[0]) >= THRESHOLDS.most_moves)
 
     def enough(self, best: Found) -> bool:
         return noise(best[1]) and not self.thorough
