@@ -51,13 +51,13 @@ def told(q, u, effects):
 @pytest.mark.exam
 @pytest.mark.parametrize(("side", "share"), [(0, 0.02 / 0.051), (1, 0.031 / 0.051)], ids=["motor", "link"])
 def test_play_is_found_from_either_side(side, share):
-    path, u = turned(0.05)
+    path, u = turned(0.08)
     found = told(path[:, side], u, ["gear-play", *OTHERS])
     assert found.verdict == "causes"
     (cause,) = found.causes
     assert cause.effect == "gear-play"
-    assert cause.parameters["width"].value == pytest.approx(0.05, rel=0.1)
-    assert cause.parameters[("motor_shift", "link_shift")[side]].value == pytest.approx(share * 0.05, rel=0.03)
+    assert cause.parameters["width"].value == pytest.approx(0.08, rel=0.1)
+    assert cause.parameters[("motor_shift", "link_shift")[side]].value == pytest.approx(share * 0.08, rel=0.03)
 
 
 @pytest.mark.exam
