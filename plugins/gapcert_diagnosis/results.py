@@ -16,7 +16,7 @@ Verdict = Literal["causes", "ambiguous", "nothing", "unexplained"]
 _ORDER = """
 viscous-friction coulomb-friction stribeck-friction lugre-friction dahl-friction quadratic-drag
 load-dependent-friction asymmetric-coulomb-friction asymmetric-viscous-friction linear-spring cubic-spring
-constant-force gravity-tilt cogging payload joint-coupling backlash external-push parameter
+constant-force gravity-tilt cogging payload joint-coupling backlash gear-play external-push parameter
 contact-friction contact-restitution engine-setting input-gain input-offset input-dead-zone input-saturation
 wheel-slip side-slip input-nonlinearity input-hysteresis input-delay input-lag input-rate-limit input-rate-limited-lag
 supply-sag sensor-bias sensor-scale sensor-delay sensor-lag sensor-quantisation

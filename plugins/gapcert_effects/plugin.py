@@ -27,6 +27,9 @@ HOMES = {
         "side-slip": "a base on wheels that moves sideways in turns",
         "external-push": "one push from outside",
     },
+    "gear": {
+        "gear-play": "play in the angle between a motor and what it drives, of which the log shows one",
+    },
     "parameters": {
         "parameter": "a parameter of the model whose stated value is wrong by more than its tolerance",
         "contact-friction": "friction between bodies that touch, stronger or weaker than the engine has it",

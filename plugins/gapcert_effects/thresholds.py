@@ -24,6 +24,7 @@ class Thresholds:
         0.1, "of the angle turned in a step: from the chord of the arc, where the speed changes meanwhile"
     )
     push_starts: int = chosen(80, "tried: the width of a push grows with the length of the recording")
+    gear_step: float = chosen(1.25e-3, "s of a sub-step at most, in which knocks between two inertias are resolved")
     latest_input: float = chosen(0.1, "of the duration of the data, that an input comes late at most")
     latest_periods: float = chosen(1000.0, "of delay, at most: each is a hidden state")
     slowest_lag: float = chosen(1.0, "of the duration of the data, of a time constant at most")

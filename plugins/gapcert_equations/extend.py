@@ -49,6 +49,8 @@ def _add(config: EquationsConfig, e: Extension, through: Sequence[str]) -> Equat
         if late is not None:
             delays = getattr(config, section)
             changes[section] = delays | {e.site: _later(where, delays.get(e.site), late)}
+    if e.substeps > config.substeps:
+        changes["substeps"] = e.substeps
     if e.output is not None:
         changes["outputs"] = _outputs(config, e)
     new = config.model_copy(update=changes)

@@ -18,7 +18,7 @@ class Thresholds:
     # mechanics
     expanded_operations: int = chosen(100, "of a text up to which it is expanded")
     # text
-    characters: int = chosen(80_000, "of an expression, at most: what a person, or a set of effects, writes is far shorter")
+    characters: int = chosen(160_000, "of an expression, at most: all effects at one coordinate write 112,000")
     depth: int = chosen(150, "of nesting: what reads it recurses")
     exponent: int = chosen(64, "larger ones overflow, and SymPy multiplies them out")
     arguments: int = chosen(8, "of min and max: cases double with each")

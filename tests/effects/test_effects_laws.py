@@ -130,7 +130,7 @@ def test_a_sagging_supply_drains_by_what_it_gave():
 
 def test_a_supply_may_sag_for_as_long_as_the_log():
     effect = gc.registry().build("effect", "supply-sag")
-    scales = {"input": 0.4, "duration": 37.0}
+    scales = {"input": 0.4, "duration": 37.0, "period": 0.01}
     times = [t for _, t in effect.grid(scales)]
     assert effect.parameters[1].bounds(scales) == (0.01, 37.0)
     assert 0.5 * 37 < max(times) < 37
@@ -417,6 +417,11 @@ APPLIES = [
     ("backlash", {**PAIR, "forces": {"q": "u"}, "inputs": {"u": "N*m"}}, {"q"}),
     ("backlash", PLAIN, set()),
     ("load-dependent-friction", {**PAIR, "forces": {"q": "u"}, "inputs": {"u": "N*m"}}, {"q"}),
+    ("gear-play", ROD, {"q"}),
+    ("gear-play", {**PAIR, "mass_matrix": [["J", "0"], ["0", "I"]], "forces": {"q": "u"}, "inputs": {"u": "N*m"}}, {"q"}),
+    ("gear-play", PAIR, set()),
+    ("gear-play", PLAIN, set()),
+    ("gear-play", {**PLAIN, "states": {"x": "m", "q": "m/s"}, "derivative": {"x": "q", "q": "u - k*q"}}, {"q"}),
     ("linear-spring", PLAIN, set()),
     ("cogging", {**PLAIN, "states": {"x": "m", "q": "m/s"}, "derivative": {"x": "q", "q": "u - k*q"}}, {"q"}),
     ("parameter", CARRIER, {"m"}),
@@ -442,3 +447,56 @@ def test_a_canonical_wave_has_a_positive_amplitude_and_a_phase_within_half_a_tur
         assert plain["amplitude"] == 0.3
         assert abs(plain["phase"]) <= math.pi
         assert plain["amplitude"] * math.sin(plain["phase"]) == pytest.approx(amplitude * math.sin(phase))
+
+
+GEAR = {
+    "kind": "equations",
+    "coordinates": {"q": "rad"},
+    "inputs": {"u": "N*m"},
+    "parameters": {"inertia": "0.05 kg*m^2", "rubs": "0.05 N*m/(rad/s)", "weighs": "0.1 N*m"},
+    "mass_matrix": [["inertia"]],
+    "bias": {"q": "weighs*sin(q)"},
+    "forces": {"q": "u - rubs*q_dot"},
+    "integrator": "rk4",
+    "period": "5 ms",
+}
+TURNS = np.sin(2 * np.pi * 0.9 * np.arange(400) * 0.005) + 0.6 * np.sin(2 * np.pi * 2.3 * np.arange(400) * 0.005)
+
+
+def two_inertias(u, link, width, damping, fine=50):
+    """Angles of motor and link (T + 1, 2) in fine steps; link: its share of the inertia; knocks throw nothing back."""
+    h, own, path = 0.005 / fine, 0.05 * np.array([1 - link, link]), [(0.0, 0.0)]
+    q, v = np.zeros(2), np.zeros(2)
+    for level in u:
+        for _ in range(fine):
+            v = v + h / own * (level - (0.05 - damping) * v[0], -damping * v[1] - 0.1 * np.sin(q[1]))
+            gap = q[0] - q[1] + h * (v[0] - v[1])
+            knock = (gap - min(max(gap, -width / 2), width / 2)) / h * own.prod() / 0.05
+            v = v + knock / own * (-1, 1)
+            q = q + h * v
+        path.append(tuple(q))
+    return np.array(path)
+
+
+def played(seen, share, width, decay):
+    """Its path (T + 1, 2) as the library has it, seen from the motor (0) or the link (1)."""
+    motor, model = gc.registry().build("effect", "gear-play"), equations(GEAR)
+    extension = (motor, motor.variants[0]())[seen].extension("q", model)
+    known = zip(extension.parameters, (width, share * width, decay), strict=True)
+    extended = model.extend([replace(extension, parameters=tuple(replace(p, value=v) for p, v in known))])
+    return extended.fast_rollout(np.zeros((1, 2)), TURNS[None, :, None]).x[0]
+
+
+@pytest.mark.parametrize("link", [0.3, 0.7])
+@pytest.mark.parametrize("seen", [0, 1], ids=["motor", "link"])
+def test_play_in_the_angle_is_two_inertias_with_a_gap(seen, link):
+    path = two_inertias(TURNS, link, 0.06, 0.02)[:, seen]
+    plain = equations(GEAR).fast_rollout(np.zeros((1, 2)), TURNS[None, :, None]).x[0, :, 0]
+    off = played(seen, (link, 1 - link)[seen], 0.06, 0.02 / (0.05 * link))[:, 0] - path
+    assert np.sqrt(np.mean(off**2)) < 0.05 * np.sqrt(np.mean((plain - path) ** 2))
+
+
+@pytest.mark.parametrize("seen", [0, 1], ids=["motor", "link"])
+def test_without_a_gap_nothing_moves_apart(seen):
+    fine = equations({**GEAR, "substeps": 4}).fast_rollout(np.zeros((1, 2)), TURNS[None, :, None]).x[0]
+    np.testing.assert_allclose(played(seen, 0.4, 0.0, 0.5), fine, atol=1e-9)

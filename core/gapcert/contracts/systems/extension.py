@@ -51,7 +51,7 @@ class Extension:
     delay: a time in s by which the input comes late; output: replaces the output `{y}`; output_delay: a time in s by which the
     output comes late; memory: hidden states; tilt: an angle in rad by which gravity is turned along the coordinate; payload: a
     point mass in kg carried at the coordinate's point; implicit: a damping D that is solved with the sub-step,
-    (M + h D) Δv = h f; frees: a parameter of the model whose tolerance is lifted.
+    (M + h D) Δv = h f; frees: a parameter of the model whose tolerance is lifted; substeps: of a period, at least.
     """
 
     effect: str
@@ -69,3 +69,4 @@ class Extension:
     payload: str | None = None
     implicit: str | None = None
     frees: str | None = None
+    substeps: int = 1
