@@ -7,6 +7,7 @@ import pytest
 
 import gapcert as gc
 from gapcert.plugin import Recording, Trajectory
+from gapcert_diagnosis.testing import equations
 
 H, N = 0.005, 2400
 NUMBERS = {"J": {"value": "0.002 kg*m^2", "tolerance": "5 %"}, "b": "0.004 N*m*s/rad", "k": "0.08 N*m/A"}
@@ -58,3 +59,33 @@ def test_friction_is_found_without_the_angle(measured, form):
     told = [a for a in found.assumptions if "were not tried" in a]
     assert bool(told) == (form != "alone")
     assert all("dahl-friction" in a and "as no output shows how it moves" in a for a in told)
+
+
+def test_a_push_is_found_where_nothing_is_measured():
+    """In the element of an oven, hundreds of kelvins from where a state that is not known would be guessed to be."""
+    rng, h, x, shown = np.random.default_rng(3), 10.0, np.array([343.0, 330.0]), []
+    power = np.repeat(rng.uniform(1, 5, 30), 30)
+    for k, p in enumerate(power):
+        shown.append(x[1])
+        for _ in range(40):
+            pushed = -0.11 if 3200 <= k * h < 3330 else 0.0
+            flow = 0.15 * (x[0] - x[1])
+            x = x + h / 40 * np.array([(p - flow) / 2.4 + pushed, (flow - 0.07 * (x[1] - 293)) / 9.3])
+    model = equations(
+        {"kind": "equations", "states": {"T1": "K", "T2": "K"}, "inputs": {"P": "W"}, "period": "10 s"}
+        | {"outputs": {"T2": "T2"}, "derivative": {"T1": "(P - k*(T1 - T2))/C1", "T2": "(k*(T1 - T2) - U*(T2 - Ta))/C2"}}
+        | {
+            "parameters": {
+                "C1": {"value": "2.42 J/K", "tolerance": "2 %"},
+                "C2": "9.3 J/K",
+                "k": "0.15 W/K",
+                "U": "0.07 W/K",
+                "Ta": "293 K",
+            }
+        }
+    )
+    seen = np.array(shown) + 0.01 * rng.standard_normal(len(shown))
+    recording = gc.Recording.of(h * np.arange(len(seen)), {"T2": seen, "P": power}, hold="zero")
+    (cause,) = gc.diagnose(model, recording, ["external-push", "parameter"], horizons=[400.0]).causes
+    assert (cause.effect, cause.site) == ("external-push", "T1")
+    assert cause.parameters["time"].value == pytest.approx(3200, abs=10)
