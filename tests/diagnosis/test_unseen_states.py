@@ -7,8 +7,11 @@ import pytest
 
 import gapcert as gc
 from gapcert.plugin import Recording, Trajectory
+<<<<<<< HEAD
 from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.fitting.hypothesis import Hypothesis
+=======
+>>>>>>> dea376abba4f7dbee16f20147e845a2305d29836
 from gapcert_diagnosis.testing import equations
 
 H, N = 0.005, 2400
@@ -63,6 +66,7 @@ def test_friction_is_found_without_the_angle(measured, form):
     assert all("dahl-friction" in a and "as no output shows how it moves" in a for a in told)
 
 
+<<<<<<< HEAD
 def test_where_no_state_is_shown_windows_begin_where_the_model_gets_to():
     """At rest a tension has no slope in the angle: from there no fit would find out which way a pendulum swings."""
     section = {"kind": "equations", "states": {"q": "rad", "w": "rad/s"}, "inputs": {"T": "N*m"}, "period": "20 ms"}
@@ -77,3 +81,33 @@ def test_where_no_state_is_shown_windows_begin_where_the_model_gets_to():
     assert not windows.start.any()
     found = Hypothesis(model).guessed(windows, np.empty(0), windows.start)
     np.testing.assert_allclose(found, x[windows.place[:, 1]], atol=1e-9)
+=======
+def test_a_push_is_found_where_nothing_is_measured():
+    """In the element of an oven, hundreds of kelvins from where a state that is not known would be guessed to be."""
+    rng, h, x, shown = np.random.default_rng(3), 10.0, np.array([343.0, 330.0]), []
+    power = np.repeat(rng.uniform(1, 5, 30), 30)
+    for k, p in enumerate(power):
+        shown.append(x[1])
+        for _ in range(40):
+            pushed = -0.11 if 3200 <= k * h < 3330 else 0.0
+            flow = 0.15 * (x[0] - x[1])
+            x = x + h / 40 * np.array([(p - flow) / 2.4 + pushed, (flow - 0.07 * (x[1] - 293)) / 9.3])
+    model = equations(
+        {"kind": "equations", "states": {"T1": "K", "T2": "K"}, "inputs": {"P": "W"}, "period": "10 s"}
+        | {"outputs": {"T2": "T2"}, "derivative": {"T1": "(P - k*(T1 - T2))/C1", "T2": "(k*(T1 - T2) - U*(T2 - Ta))/C2"}}
+        | {
+            "parameters": {
+                "C1": {"value": "2.42 J/K", "tolerance": "2 %"},
+                "C2": "9.3 J/K",
+                "k": "0.15 W/K",
+                "U": "0.07 W/K",
+                "Ta": "293 K",
+            }
+        }
+    )
+    seen = np.array(shown) + 0.01 * rng.standard_normal(len(shown))
+    recording = gc.Recording.of(h * np.arange(len(seen)), {"T2": seen, "P": power}, hold="zero")
+    (cause,) = gc.diagnose(model, recording, ["external-push", "parameter"], horizons=[400.0]).causes
+    assert (cause.effect, cause.site) == ("external-push", "T1")
+    assert cause.parameters["time"].value == pytest.approx(3200, abs=10)
+>>>>>>> dea376abba4f7dbee16f20147e845a2305d29836
