@@ -390,14 +390,14 @@ class _Past:
         spread, size = np.maximum(np.std(np.concatenate(m.states), axis=0), 1e-300), np.maximum(size, 1e-300)
 
         def off(by: Array) -> Array:
-            return difference(model.states, model.step(x, flat(u) + by, parameters=rows).x, x) / spread
+            return np.asarray(difference(model.states, model.step(x, flat(u) + by, parameters=rows).x, x) / spread)
 
         with np.errstate(all="ignore"):
             here = off(np.zeros(model.nu))
             slope = np.nan_to_num(np.stack([off(d) - here for d in np.diag(size)], axis=-1))
             moved = (np.linalg.pinv(slope) @ np.nan_to_num(here)[..., None])[..., 0].reshape(u.shape) * size
         new = np.minimum(np.abs(u - moved), np.abs(moved)) > THRESHOLDS.other_level * size
-        return np.asarray(u - moved) if new.any() else None
+        return u - moved if new.any() else None
 
     def _settled(self, u: Array, hidden: Array) -> Array:
         """What is remembered where first states, and inputs (count, pieces, nu), have been held for as long as the log is."""
