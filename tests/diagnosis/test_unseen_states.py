@@ -7,11 +7,8 @@ import pytest
 
 import gapcert as gc
 from gapcert.plugin import Recording, Trajectory
-<<<<<<< HEAD
 from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.fitting.hypothesis import Hypothesis
-=======
->>>>>>> dea376abba4f7dbee16f20147e845a2305d29836
 from gapcert_diagnosis.testing import equations
 
 H, N = 0.005, 2400
@@ -66,7 +63,6 @@ def test_friction_is_found_without_the_angle(measured, form):
     assert all("dahl-friction" in a and "as no output shows how it moves" in a for a in told)
 
 
-<<<<<<< HEAD
 def test_where_no_state_is_shown_windows_begin_where_the_model_gets_to():
     """At rest a tension has no slope in the angle: from there no fit would find out which way a pendulum swings."""
     section = {"kind": "equations", "states": {"q": "rad", "w": "rad/s"}, "inputs": {"T": "N*m"}, "period": "20 ms"}
@@ -81,7 +77,8 @@ def test_where_no_state_is_shown_windows_begin_where_the_model_gets_to():
     assert not windows.start.any()
     found = Hypothesis(model).guessed(windows, np.empty(0), windows.start)
     np.testing.assert_allclose(found, x[windows.place[:, 1]], atol=1e-9)
-=======
+
+
 def test_a_push_is_found_where_nothing_is_measured():
     """In the element of an oven, hundreds of kelvins from where a state that is not known would be guessed to be."""
     rng, h, x, shown = np.random.default_rng(3), 10.0, np.array([343.0, 330.0]), []
@@ -110,4 +107,3 @@ def test_a_push_is_found_where_nothing_is_measured():
     (cause,) = gc.diagnose(model, recording, ["external-push", "parameter"], horizons=[400.0]).causes
     assert (cause.effect, cause.site) == ("external-push", "T1")
     assert cause.parameters["time"].value == pytest.approx(3200, abs=10)
->>>>>>> dea376abba4f7dbee16f20147e845a2305d29836
