@@ -296,7 +296,7 @@ def _begun(h: Hypothesis, windows: Windows, here: Slopes, ends: _Ends) -> Hypoth
 
     ways = [0 * first, first]
     lost = [left(way) for way in ways]
-    if np.array_equal(*lost):
+    if np.array_equal(lost[0], lost[1]):
         return None
     best, square = (a[int(lost[1].sum() < lost[0].sum())] for a in (ways, lost))
     fitted, least, span = best.copy(), square.copy(), np.concatenate(m.inputs)
