@@ -64,9 +64,9 @@ def graded(low: float, high: float) -> tuple[float, ...]:
 
 
 def times(parameter: EffectParameter, scales: Mapping[str, float], share: float = 0.9) -> tuple[float, ...]:
-    """From half a period of sampling to this share of the longest time that a parameter may take."""
+    """From a tenth of a period of sampling to this share of the longest time that a parameter may take."""
     high = share * parameter.bounds(scales)[1]
-    return graded(min(0.5 * scales["period"], 0.5 * high), high)
+    return graded(min(0.1 * scales["period"], 0.5 * high), high)
 
 
 def driven(site: str, model: gc.Model) -> bool:
