@@ -396,13 +396,13 @@ class Data:
         return replace(self, library=library, windows=replace(self.windows, measured=library.measured), held=held)
 
     def whole(self, problem: DiagnosisProblem, found: Fit) -> Data | None:
-        """With windows from the first samples on, where a fit leaves more of these: what acts only there is seen."""
+        """With windows from the first samples on, where a fit leaves far more of these: what acts only there is seen."""
         m, length = replace(self.library.measured, whole=True), self.windows.length
         first = [(i, m.history) for i, y in enumerate(m.outputs) if len(y) >= m.history + length]
         if self.library.measured.history == m.history or not first:
             return None
         begun = followed(found.hypothesis, found.theta, m.at(np.array(first), length))
-        if (np.sqrt(begun.chi / np.maximum(found.chi, 1.0)) < THRESHOLDS.loud_channel).all():
+        if (begun.chi < THRESHOLDS.push_rare * np.maximum(found.chi, 1.0)).all():
             return None
         library = self.library.under(self.library.model, problem.effects, m)
         windows = library.measured.windows(length).thinned(THRESHOLDS.fitted_values, THRESHOLDS.guard_windows)

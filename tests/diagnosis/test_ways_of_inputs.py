@@ -316,3 +316,24 @@ def test_a_thermometer_may_show_thousands_of_kelvin():
     """From there to 300 K no slope leads, and a heat that is not there would make up for some of it."""
     (cause,) = told(OVEN, 9 * commands(600, 50, 13, low=0.0), lambda u, h: u, 0.001).causes
     assert (cause.effect, cause.unit_slip) == ("sensor-scale", "1000")
+
+
+@pytest.mark.exam
+@pytest.mark.parametrize("slow", [True, False])
+def test_one_of_two_sensors_may_lag(slow):
+    """What both show late would be late before it moves; the one that lags alone does so itself."""
+    section = {"kind": "equations", "states": {"v": "V"}, "inputs": {"u": "V"}, "period": "10 ms", "integrator": "rk4"}
+    section |= {"parameters": {"T": {"value": "0.2 s", "tolerance": "3 %"}}, "derivative": {"v": "(u - v)/T"}}
+    section |= {"outputs": {"near": "v", "far": "0.5*v"}}
+    u, rng, h = commands(900, 25, 21), np.random.default_rng(3), 0.01 / FINE
+    v, z, rows = 0.0, 0.0, []
+    for level in u:
+        rows.append((v, 0.5 * z if slow else 0.5 * v))
+        for _ in range(FINE):
+            before, v = v, level + (v - level) * np.exp(-h / 0.2)
+            z += ((before + v) / 2 - z) * -np.expm1(-h / 0.04)
+    near, far = (np.array(rows) + 0.002 * rng.standard_normal((len(u), 2))).T
+    log = gc.Recording.of(0.01 * np.arange(len(u)), {"near": near, "far": far, "u": u}, hold="zero")
+    found = diagnose(equations(section), log, ["sensor-lag", "sensor-delay", "sensor-scale", "input-lag"])
+    assert [(c.effect, c.site) for c in found.causes] == ([("sensor-lag", "far")] if slow else [])
+    assert not slow or found.causes[0].parameters["time_constant"].value == pytest.approx(0.04, rel=0.05)

@@ -155,10 +155,11 @@ def _strongest(model: Model, last: Fit, measured: Dataset, length: int) -> Itera
     most = np.stack([g[row, k] for g, k in zip(gain, best, strict=True)], axis=-1)
     gains = most.max(axis=1)
     rest = max(1.0, float(np.median((energy - gains) / np.maximum(np.sum(windows.weight**2, axis=(1, 2)), 1))))
-    rho = max(0.0, float(np.median([lag_one(r[None]).max() for r in motion.residual.reshape(windows.y.shape)])))
-    # Neighbours that are alike are fewer, and their sum is larger.
-    chance = THRESHOLDS.push_beyond * rest * (1 + rho) / (1 - rho) * charge(len(sites) * len(first) * len(row))
+    chance = THRESHOLDS.push_beyond * rest * charge(len(sites) * len(first) * len(row))
     plain = gains > THRESHOLDS.push_share * (energy - np.median(energy))
+    # Neighbours that are alike count for fewer, and their sum is larger by chance.
+    rho = max(0.0, float(np.median([lag_one(r[None]).max() for r in motion.residual.reshape(windows.y.shape)])))
+    plain &= gains > chance * (1 + rho) / (1 - rho)
     # What moves outputs by less than 1.5 noise floors from its beginning on, or is little force, may be an integrator's.
     best_site = most.argmax(axis=1)
     begun = edges[first[np.stack(best, axis=-1)[row, best_site]]]
