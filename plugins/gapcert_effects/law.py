@@ -91,6 +91,23 @@ def _mechanical(model: gc.Model) -> bool:
     return bool(_section(model, "coordinates"))
 
 
+def rigid(site: str, model: gc.Model) -> tuple[str, str, str, str] | None:
+    """(inertia, applied force, bias, speed) as text of what an input moves at a coordinate, or at the equation of a speed.
+
+    None where no input acts there, or other coordinates move it as well.
+    """
+    if not driven(site, model):
+        return None
+    if not _mechanical(model):
+        return "1", str(_section(model, "derivative")[site]), "", site
+    rows, i = _section(model, "mass_matrix"), model.coordinates.index(site)
+    others = rows and [str(row[i]) for k, row in enumerate(rows) if k != i]
+    if not rows or any(text.strip() not in ("0", "0.0") for text in others):
+        return None
+    force = str(_section(model, "forces").get(site, "0"))
+    return f"({rows[i][i]})", force, str(_section(model, "bias").get(site, "")), f"{site}_dot"
+
+
 def straight(site: str, model: gc.Model) -> bool:
     """Is the coordinate a length?"""
     units = {s.name: s.unit for s in model.states}
@@ -184,7 +201,7 @@ def neighbour(site: str, model: gc.Model) -> str | None:
     return alike[i + 1] if i + 1 < len(alike) else alike[i - 1]
 
 
-def _section(model: gc.Model, *keys: str) -> Mapping[str, object]:
+def _section(model: gc.Model, *keys: str) -> Any:
     spec = model.text()
     return next((spec[k] for k in keys if spec.get(k)), {})
 

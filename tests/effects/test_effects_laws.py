@@ -130,10 +130,11 @@ def test_a_sagging_supply_drains_by_what_it_gave():
 
 def test_a_supply_may_sag_for_as_long_as_the_log():
     effect = gc.registry().build("effect", "supply-sag")
-    scales = {"input": 0.4, "duration": 37.0, "period": 0.01}
+    scales = {"input": 0.4, "duration": 37.0, "period": 0.004}
     times = [t for _, t in effect.grid(scales)]
     assert effect.parameters[1].bounds(scales) == (0.01, 37.0)
     assert 0.5 * 37 < max(times) < 37
+    assert min(times) == 5 * 0.004
     assert max(t for _, t in effect.grid(scales | {"duration": 1.5})) < 1.5
 
 
