@@ -13,7 +13,7 @@ from gapcert.plugin import EffectParameter, Extension, Memory, site_units
 from gapcert_effects.thresholds import THRESHOLDS
 
 from .experiments import FREE_DECAY, SHAKE_AND_HOLD
-from .law import Law, moves, placed, rigid, spread
+from .law import Law, moves, placed, rigid, spread, turns
 
 _WORD = re.compile(r"[^\W\d]\w*")
 
@@ -30,7 +30,7 @@ class _Gap(Law):
 
     name = "gear-play"
     hides_motor: ClassVar = False
-    where = (placed, moves, rigid)
+    where = (placed, moves, turns, rigid)
     signature = "after every reversal one inertia moves alone across the gap, and both of them from the knock on"
     experiment = "reverse the drive slowly and often, then fast: the way across the gap is the same"
     family = "gap"

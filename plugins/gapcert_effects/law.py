@@ -114,6 +114,11 @@ def straight(site: str, model: gc.Model) -> bool:
     return units[site] in _LENGTHS if _mechanical(model) else units[site].removesuffix("/s") in _LENGTHS
 
 
+def turns(site: str, model: gc.Model) -> bool:
+    """Is the coordinate no length, but an angle?"""
+    return not straight(site, model)
+
+
 def moves(site: str, model: gc.Model) -> bool:
     """Does something move there, by its unit: is the coordinate a length, an angle or a pure number, or the state a speed?
 

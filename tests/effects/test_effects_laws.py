@@ -422,7 +422,7 @@ APPLIES = [
     ("gear-play", {**PAIR, "mass_matrix": [["J", "0"], ["0", "I"]], "forces": {"q": "u"}, "inputs": {"u": "N*m"}}, {"q"}),
     ("gear-play", PAIR, set()),
     ("gear-play", PLAIN, set()),
-    ("gear-play", {**PLAIN, "states": {"x": "m", "q": "m/s"}, "derivative": {"x": "q", "q": "u - k*q"}}, {"q"}),
+    ("gear-play", {**PLAIN, "states": {"x": "m", "q": "m/s"}, "derivative": {"x": "q", "q": "u - k*q"}}, set()),
     ("linear-spring", PLAIN, set()),
     ("cogging", {**PLAIN, "states": {"x": "m", "q": "m/s"}, "derivative": {"x": "q", "q": "u - k*q"}}, {"q"}),
     ("parameter", CARRIER, {"m"}),
