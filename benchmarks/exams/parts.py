@@ -83,7 +83,7 @@ def nothing(records: Sequence[Record]) -> list[Figure]:
 def pairs(records: Sequence[Record]) -> list[Figure]:
     spare = sum(map(score.extra, records)) / max(len(records), 1)
     return [
-        least("both named", score.rate(records, score.both), 0.9),
+        least("both named", score.rate(records, score.both), 0.92),
         least("both named, or what fits as well with as few causes and numbers", score.rate(records, score.both_or_as_well)),
         Figure("names beyond the two, per answer", "names", spare),
     ]
@@ -101,8 +101,8 @@ def unknown(records: Sequence[Record]) -> list[Figure]:
     records = [r for r in records if not r["stands"]]
     return [
         Figure("answers that fit as well as the truth, not counted below", "cases", equal),
-        least("unexplained, or flagged as inadequate", score.rate(records, honest), 0.95),
-        most("a confident wrong name", score.rate(records, confident), 0.03),
+        least("unexplained, or flagged as inadequate", score.rate(records, honest), 0.97),
+        most("a confident wrong name", score.rate(records, confident), 0.02),
     ]
 
 

@@ -53,6 +53,9 @@ class DartConfig(EngineConfig):
         """Can the robot touch anything?"""
         return self.self_collision or self.ground is not None
 
+    def unsaid(self) -> set[str]:
+        return {"lcp_tolerance"} if self.lcp_tolerance == 1e-5 else set()
+
     def coarse(self) -> dict[str, Any]:
         """Where a contact slides, nsgs and fbf take ten times as long for the last two digits."""
         return {"lcp_tolerance": _COARSE} if self.lcp_solver in ("nsgs", "fbf") and self.lcp_tolerance < _COARSE else {}

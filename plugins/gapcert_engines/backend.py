@@ -62,7 +62,7 @@ class EngineBackend(Backend):
             self._worlds.clear()
 
     def digest(self) -> str:
-        physics = self.config.model_dump(mode="json", exclude={"robot", "tiles", "threads", "period"})
+        physics = self.config.model_dump(mode="json", exclude={"robot", "tiles", "threads", "period"} | self.config.unsaid())
         axes = [[s.name, s.unit, s.kind] for s in (*self.states, *self.inputs)]
         data = [type(self.engine).__qualname__, physics, self.period, axes, self.engine.digest_data()]
         # Where inputs are efforts, the file's gear is none of their business.

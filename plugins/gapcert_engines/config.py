@@ -79,6 +79,10 @@ class EngineConfig(BaseModel, ABC):
         """Values worth trying when this engine disagrees with another: dotted option → candidates (a mapping sets several)."""
         return {"substeps": tuple(k for k in (1, 2, 5, 10) if k != self.substeps)}
 
+    def unsaid(self) -> set[str]:
+        """Options that are as they were before there was a choice: a digest leaves them out."""
+        return set()
+
     def coarse(self) -> dict[str, Any]:
         """Options with which this engine is much faster and nearly the same, for what is only tried; none by default."""
         return {}

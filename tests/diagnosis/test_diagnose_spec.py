@@ -64,7 +64,7 @@ def test_the_command_names_the_cause(spec, tmp_path, capsys):
     assert "viscous friction at q" in err
 
 
-@pytest.mark.run
+@pytest.mark.exam
 def test_what_a_tolerance_let_the_data_move_is_told(spec, tmp_path):
     parameters = {"mass": {"value": "2.06 kg", "tolerance": "5 %"}, "b": "0.8 N*s/m"}
     model = spec["model"] | {"parameters": parameters, "forces": {"q": "F - b*q_dot"}}

@@ -93,7 +93,7 @@ def test_nothing_is_no_answer_to_what_an_output_shows(name, kind, lack):
         assert found.causes
 
 
-@pytest.mark.parametrize("lack", ["dry friction", "hysteresis"])
+@pytest.mark.parametrize("lack", [pytest.param("dry friction", marks=pytest.mark.exam), "hysteresis"])
 def test_what_is_left_is_told_by_its_kind(lack):
     found = diagnosed("strut", lack, 20.0, 5)
     assert found.verdict == "unexplained"
@@ -115,6 +115,7 @@ def test_noise_of_any_colour_is_nothing(name, colour):
         assert diagnosed(name, None, 0.0, seed, ("smooth", "steps")[seed % 2], colour).verdict == "nothing"
 
 
+@pytest.mark.exam
 def test_an_output_alone_whose_state_nothing_shows_is_answered():
     """The strut's force alone: its position is in no channel, and moves none but through the force."""
     rng = np.random.default_rng(2)
@@ -141,7 +142,10 @@ def path(rng, kind):
     return u, np.array(list(held(lambda y, a: a + (y - a) * np.exp(-H / 0.06), u))), {"time_constant": 0.06}
 
 
-@pytest.mark.parametrize("kind", ["input-saturation", "input-dead-zone", "input-delay", "input-lag"])
+@pytest.mark.parametrize(
+    "kind",
+    ["input-dead-zone", *(pytest.param(k, marks=pytest.mark.exam) for k in ("input-saturation", "input-delay", "input-lag"))],
+)
 def test_what_happens_to_an_input_reaches_the_outputs_it_drives(kind):
     """An accelerometer on a damped mass: it shows the effort that acts, beside a log of the command."""
     rng = np.random.default_rng(4)

@@ -48,7 +48,14 @@ def test_what_comes_back_is_as_long_as_what_it_is_made_of(count):
     assert abs(back.sum(axis=0)).max() <= 3
 
 
-@pytest.mark.parametrize(("name", "part"), [("told_apart", "experiment"), ("figure", "pictures"), ("evidence", "tests of the")])
+@pytest.mark.parametrize(
+    ("name", "part"),
+    [
+        pytest.param("told_apart", "experiment", marks=pytest.mark.exam),
+        ("figure", "pictures"),
+        pytest.param("evidence", "tests of the", marks=pytest.mark.exam),
+    ],
+)
 def test_a_defect_after_the_answer_leaves_it_standing(whole, monkeypatch, name, part):
     def broken(*given):
         raise ZeroDivisionError("no such thing")

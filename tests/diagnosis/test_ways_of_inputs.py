@@ -86,7 +86,9 @@ def only(found, name):
     return {n: p.value for n, p in found.causes[0].parameters.items()}
 
 
-@pytest.mark.parametrize(("name", "number"), [("input-lag", "time_constant"), ("input-delay", "delay")])
+@pytest.mark.parametrize(
+    ("name", "number"), [pytest.param("input-lag", "time_constant", marks=pytest.mark.exam), ("input-delay", "delay")]
+)
 def test_an_oven_may_be_late_by_minutes(name, number):
     late = delayed if name == "input-delay" else lagged
     found = told(OVEN, 9 * commands(600, 50, 1, low=0.0), lambda u, h: late(u, 80.0, h))
@@ -116,7 +118,13 @@ def test_what_acts_at_the_first_samples_only_is_not_nothing():
 
 @pytest.mark.parametrize(
     ("name", "number", "held"),
-    [("input-lag", 90.0, None), ("input-rate-limit", 0.06, None), ("input-lag", 90.0, 8.0), ("input-delay", 22.0, 3.0)],
+    [
+        ("input-lag", 90.0, 8.0),
+        *(
+            pytest.param(*case, marks=pytest.mark.exam)
+            for case in (("input-lag", 90.0, None), ("input-rate-limit", 0.06, None), ("input-delay", 22.0, 3.0))
+        ),
+    ],
 )
 def test_a_log_may_begin_at_an_input_that_was_held(name, number, held):
     """At its first input, or at another one that nothing in the log shows."""
@@ -164,6 +172,7 @@ def test_what_a_lag_blunts_is_found_behind_it(second):
     assert {c.effect for c in found.causes} == {"input-lag", second}
 
 
+@pytest.mark.exam
 def test_a_curve_is_no_answer_where_two_plain_laws_are():
     def way(u, h):
         return 0.7 * np.tanh((u - np.clip(u, -0.03, 0.08)) / 0.7)
@@ -196,6 +205,7 @@ def test_an_amplifier_bends():
     assert found == {"square": pytest.approx(0.0, abs=0.003), "cube": pytest.approx(0.02, rel=0.05)}
 
 
+@pytest.mark.exam
 def test_any_curve_is_drawn_through_the_data():
     levels, bent = np.linspace(-1, 1, 7), np.array([-0.9, -0.75, -0.15, 0.0, 0.4, 0.45, 1.1])
     found = told(VALVE, commands(1500, 25, 8), lambda u, h: np.interp(u, levels, bent))
@@ -248,6 +258,7 @@ def test_a_valve_that_bends_and_plays_is_found_though_it_rumbles(bends):
     assert found.gain["10"]["y"].after < 0.03 * np.std(path)
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize(("plant", "peak", "rate"), [(OVEN, 9.0, 0.06), (VALVE, 1.0, 1.5)])
 def test_a_rate_is_looked_for_on_the_scale_of_the_log(plant, peak, rate):
     def acting(u, h):
