@@ -341,7 +341,6 @@ class Thresholds:
     alone_promise: float = chosen(0.5, "of a pile's, that its best member may have: else single steps find it")
     beam: int = chosen(3, "sets that are grown at once while more than noise is left")
     lost_search: float = chosen(100.0, "mean square in noise floors: from it on only a cautious search goes on")
-    settled_share: float = chosen(0.01, "of the squared residual, that a set leaves which explains nearly all")
     plain_hold: float = chosen(0.5, "of the squared residual that one hold leaves, for the other one to be tried first")
     shakes: tuple[float, float] = threshold((0.93, 1.05), "of all numbers: measured, a dry law came right from 0.9 of truth")
     close_residual: float = chosen(2.0, "times the least: restarts are for laws that are close to it, but not at the noise")

@@ -72,7 +72,7 @@ class SensorDelay(Law):
     rivals: ClassVar = {"input-delay": SECOND, "input-lag": FAST}
 
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
-        return [(t,) for t in times(self.parameters[0], scales)]
+        return [(t,) for t in times(self.parameters[0], scales, least=0.4)]
 
 
 _BEHIND = "{time_constant}/{h}*(1 - exp(-{h}/max({time_constant}, 0.001*{h})))"

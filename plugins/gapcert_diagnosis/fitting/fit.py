@@ -278,7 +278,7 @@ def _begun(h: Hypothesis, windows: Windows, here: Slopes, ends: _Ends) -> Hypoth
     and another input where that leaves plainly less. None where little changes.
     """
     m, p, k = windows.measured, len(here.theta), THRESHOLDS.begun_values
-    if m.exact or not any(s.name != "time" for s in h.model.hidden):
+    if m.exact or m.whole or not any(s.name != "time" for s in h.model.hidden):
         return None
     pieces, of = np.unique(windows.place[:, 0], return_inverse=True)
     keys, first = [m.beginning(i) for i in pieces.tolist()], np.stack([m.driven[i][0] for i in pieces.tolist()])

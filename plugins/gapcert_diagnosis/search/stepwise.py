@@ -129,9 +129,8 @@ class EquationSearch:
         return outdoes(new[1], best[1], *self.sets.charges(new, best), larger=len(new[0]) > len(best[0]))
 
     def settled(self, best: Found) -> bool:
-        """Far from noise, is it a pile of causes, or next to nothing of what was missing? Of such, samples say no more."""
-        gone = float(best[1].chi.sum()) < THRESHOLDS.settled_share * float(self.sets.nothing.chi.sum())
-        return best[1].chi.max() > THRESHOLDS.lost_search and (gone or len(best[0]) >= THRESHOLDS.most_moves)
+        """Is it a pile of causes, far from noise? Of such, samples say no more."""
+        return best[1].chi.max() > THRESHOLDS.lost_search and len(best[0]) >= THRESHOLDS.most_moves
 
     def enough(self, best: Found) -> bool:
         return noise(best[1]) and not self.thorough
@@ -190,7 +189,8 @@ class EquationSearch:
         """What was found, or two plain laws in the place of one of many numbers: it can bend to what they are together."""
         sets, library, best = self.sets, self.sets.library, found
         for c in found[0]:
-            if len(c.effect.parameters) < (THRESHOLDS.table_numbers if noise(found[1]) else 2):
+            few = c.effect.site == "input" and not noise(found[1])
+            if len(c.effect.parameters) < (2 if few else THRESHOLDS.table_numbers):
                 continue
             rest = without(found[0], (c,))
             plain = [(e, (*rest, e)) for e in library.candidates if library.within(e, c)]
