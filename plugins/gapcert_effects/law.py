@@ -63,9 +63,7 @@ def graded(low: float, high: float) -> tuple[float, ...]:
     return spread(low, high, 1 + math.ceil(math.log(high / low) / math.log(THRESHOLDS.next_time)))
 
 
-def times(
-    parameter: EffectParameter, scales: Mapping[str, float], share: float = 0.9, least: float = 0.1
-) -> tuple[float, ...]:
+def times(parameter: EffectParameter, scales: Mapping[str, float], share: float = 0.9, least: float = 0.1) -> tuple[float, ...]:
     """From `least` of a period of sampling to this share of the longest time that a parameter may take."""
     high = share * parameter.bounds(scales)[1]
     return graded(min(least * scales["period"], 0.5 * high), high)

@@ -189,7 +189,7 @@ class EquationSearch:
         """What was found, or two plain laws in the place of one of many numbers: it can bend to what they are together."""
         sets, library, best = self.sets, self.sets.library, found
         for c in found[0]:
-            few = c.effect.site == "input" and not noise(found[1])
+            few = c.effect.site == "input" and not noise(found[1]) and found[1].chi.max() < THRESHOLDS.lost_search
             if len(c.effect.parameters) < (2 if few else THRESHOLDS.table_numbers):
                 continue
             rest = without(found[0], (c,))
