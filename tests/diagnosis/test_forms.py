@@ -54,6 +54,7 @@ def test_every_effect_fits_the_units_of_the_model_where_it_applies(form):
     assert offered > 20
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("form", FORMS)
 def test_what_a_normalised_model_lacks_is_found_and_saved_in_its_units(form, tmp_path):
     """Friction of 0.3 per inertia, in a log from small steps of another integrator."""

@@ -145,6 +145,7 @@ def test_inside_its_tolerance_a_parameter_is_no_cause():
 
 
 @pytest.mark.parametrize("level", [0.12, 1.2])
+@pytest.mark.exam
 def test_a_saturation_far_below_what_was_asked_is_found(level):
     answer = named(*simulated(LOOSE, [("input-saturation", "u", (level,))]))
     assert names(answer) == ["input-saturation"]

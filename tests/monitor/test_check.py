@@ -392,6 +392,11 @@ def test_a_monitor_of_a_folder_says_what_that_of_its_certificate_says(more, tmp_
 
 
 @pytest.mark.run
+@pytest.mark.parametrize(
+    "run",
+    ["affine", "constant", *(pytest.param(kind, marks=pytest.mark.exam) for kind in ("model", "relative"))],
+    indirect=True,
+)
 def test_the_command_and_its_exit_codes(run, tmp_path, capsys):
     rows = swing(gc.load_spec(SPEC).build("backend"))
 
