@@ -340,7 +340,9 @@ class Thresholds:
     crowd: int = chosen(100, "candidates from which sets are piled up: a fit for each takes minutes")
     alone_promise: float = chosen(0.5, "of a pile's, that its best member may have: else single steps find it")
     beam: int = chosen(3, "sets that are grown at once while more than noise is left")
-    lost_search: float = chosen(100.0, "mean square in noise floors: from it on only a cautious search goes on")
+    lost_search: float = chosen(
+        100.0, "mean square in noise floors: from it on a pile of causes is searched cautiously only, and no law taken apart"
+    )
     plain_hold: float = chosen(0.5, "of the squared residual that one hold leaves, for the other one to be tried first")
     shakes: tuple[float, float] = threshold((0.93, 1.05), "of all numbers: measured, a dry law came right from 0.9 of truth")
     close_residual: float = chosen(2.0, "times the least: restarts are for laws that are close to it, but not at the noise")

@@ -265,6 +265,7 @@ def within(
     goes across.
     """
     nodes = [x]
+    # Later nodes remember what the first does, which is up to three steps old: it bends what a step adds, not where it begins.
     for _ in range(THRESHOLDS.sample_nodes - 1):
         nodes.append(model.along(nodes[-1], u, parameters=values, hidden=hidden))
     first = np.clip(np.floor(np.nan_to_num(at)), 0, x.shape[1] - 1)
