@@ -501,3 +501,13 @@ def test_play_in_the_angle_is_two_inertias_with_a_gap(seen, link):
 def test_without_a_gap_nothing_moves_apart(seen):
     fine = equations({**GEAR, "substeps": 4}).fast_rollout(np.zeros((1, 2)), TURNS[None, :, None]).x[0]
     np.testing.assert_allclose(played(seen, 0.4, 0.0, 0.5), fine, atol=1e-9)
+
+
+def test_long_laws_go_into_a_saturated_root():
+    """A text that SymPy would expand for minutes, to learn whether a tanh of it is real."""
+    numbers = {"k": "3 m/(s*V)", "r": "0.2", "us": "0.4 V", "tau": "0.1 s"}
+    slope = {"y": "v", "v": "(k*u*sqrt(1 - r*tanh(u/us)) - v)/tau"}
+    section = {"states": {"y": "m", "v": "m/s"}, "inputs": {"u": "V"}, "period": "5 ms", "integrator": "rk4"}
+    model = equations({"kind": "equations", **section, "parameters": numbers, "derivative": slope})
+    laws = [gc.registry().build("effect", name) for name in ("supply-sag", "input-rate-limited-lag")]
+    assert len(model.extend([law.extension("u", model) for law in laws]).hidden) == 2

@@ -10,8 +10,9 @@ import sympy
 
 from .grammar import FUNCTIONS, ExpressionError, constant, parse
 
-# SymPy's own Min and Max compare all arguments with each other, which can take very long; it has no rounding.
-_PLAIN = ("round", "min", "max")
+# SymPy's own Min and Max compare all arguments with each other, and its tanh expands its own to learn whether it is real: both
+# can take very long; it has no rounding.
+_PLAIN = ("round", "min", "max", "tanh")
 _SYMBOLIC: dict[str, Any] = {
     name: sympy.Function(name, real=True) if name in _PLAIN else getattr(sympy, "Abs" if name == "abs" else name)
     for name in FUNCTIONS
