@@ -48,6 +48,7 @@ def test_plants_move_as_their_equations_say(played, name):
     assert np.abs(y - motion.x[:, columns]).max() < 1e-4 * np.std(motion.x[:, columns], axis=0).min()
 
 
+@pytest.mark.exam
 @pytest.mark.parametrize("effect", [n for n in KNOWN if n not in OUTPUTS])
 def test_effects_act_as_the_library_writes_them(played, effect):
     made, model, still = played(PLACES.get(effect, ("pendulum", "base")[len(effect) % 2]))

@@ -146,6 +146,7 @@ def test_many_limbs_move_as_in_c_and_each_time_to_the_same_bits(tmp_path):
         assert ours.rollout(x, u).x.tobytes() == first.tobytes()
 
 
+@pytest.mark.exam
 def test_nothing_is_left_to_the_order_in_which_threads_arrive(tmp_path):
     """No floating sum over rows that an index names is left of what MJX does, of which there are some."""
     from gapcert_mujoco import xla

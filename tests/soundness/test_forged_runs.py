@@ -169,7 +169,7 @@ FORGERIES: dict[str, tuple[str, str, Any, str]] = {
 }
 
 
-@pytest.mark.contract
+@pytest.mark.exam
 @pytest.mark.parametrize("name", FORGERIES)
 def test_a_forgery_is_told(runs, out, tmp_path, name):
     kind, file, change, why = FORGERIES[name]
