@@ -11,8 +11,8 @@ import gapcert as gc
 from gapcert.testing import multisine
 from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.experiment import Limits, told_apart
-from gapcert_diagnosis.fitting.fit import fit
-from gapcert_diagnosis.search import gains
+from gapcert_diagnosis.fitting.fit import fit, followed
+from gapcert_diagnosis.search import alternatives, gains
 from gapcert_diagnosis.search import screening as screen
 from gapcert_diagnosis.search.alternatives import answered, flags
 from gapcert_diagnosis.search.candidates import Library
@@ -420,3 +420,49 @@ def test_a_larger_set_must_pay_for_itself_on_whatever_path_it_was_found():
     assert search.better(more[1], few[1]) > library.charge()
     assert not EquationSearch(search).outdoes(more, few)
     assert EquationSearch(search).outdoes(few, ((), search.nothing))
+
+
+def test_a_law_is_looked_for_beside_a_number_whose_prior_hides_it():
+    """Of what a factor of 1.24 does, a resistance that is a fifth off hides so much that neither pays without the other."""
+    section = {"kind": "equations", "integrator": "rk4", "states": {"v": "V"}, "inputs": {"u": "V"}, "period": "10 ms"}
+    stated = {"R": {"value": "1 ohm", "tolerance": "2 %"}, "C": {"value": "0.12 F", "tolerance": "2 %"}}
+    section |= {"derivative": {"v": "(u - v)/(R*C)"}, "parameters": stated}
+    u = np.repeat(np.random.default_rng(5).uniform(-1, 1, T // 20), 20)[:, None]
+    wrong = ("sensor-scale", "v", (1.24,)), {"R": np.array([1.2])}
+    model, log = simulated(section, wrong[:1], 2e-3, u=u, channels=("v",), changed=wrong[1])
+    effects = [find(n) for n in ("sensor-scale", "input-lag", "sensor-lag", "supply-sag", "parameter")]
+    library, windows = prepared(model, log, effects)
+    search = EquationSearch(FittedSets(library, windows))
+    found = search.try_pairs(search.nothing)
+    assert {c.effect.name for c in found[0]} == {"sensor-scale", "parameter"}
+    assert found[1].values["sensor_scale_v"] == pytest.approx(1.24, rel=0.01)
+    assert found[1].values["R"] * found[1].values["C"] == pytest.approx(0.144, rel=0.01)
+
+
+def test_a_fit_that_stalls_goes_on_from_the_numbers_of_a_law_that_contains_its_own():
+    model, log = simulated(WAYS, [("input-rate-limit", "u", (3.0,))], noise=1e-4, channels=("x", "y"))
+    library, windows = prepared(model, log, [find("input-rate-limit"), find("input-rate-limited-lag")])
+    sets = FittedSets(library, windows)
+    one, two = sorted((c for c in library.candidates if c.site == "u"), key=lambda c: c.effect.name)
+    right = sets.fit((two,), None, {"input_rate_limited_lag_u_rate": 3.0, "input_rate_limited_lag_u_time_constant": 1e-4})
+    stalled = followed(h := library.hypothesis((one,)), h.theta({"input_rate_limit_u": 4.0}), windows)
+    assert sets.better(right, stalled) > 100
+    again = alternatives._plainer(sets, (two,), two, (one,), stalled)
+    assert sets.better(right, again) < 0
+    assert again.values["input_rate_limit_u"] == pytest.approx(3.0, rel=0.01)
+    assert alternatives._plainer(sets, (two,), two, (one,), again) is again
+
+
+def test_what_is_smaller_than_all_first_values_of_a_law_is_promised_as_well():
+    """A sensor that is late by 0.08 of a sample, where the least that is tried is 0.4: 0.6 of that leaves more than none."""
+    t, rng, seconds = np.arange(T) * PERIOD, np.random.default_rng(3), 8e-4
+    u = multisine(T * PERIOD, PERIOD, 2.0, (0.2, 2.5), 4)
+    x = np.concatenate([[0.0], np.cumsum(PERIOD * u[:-1, 0])])
+    shown = np.interp(t - seconds, t, x) + 1e-4 * rng.standard_normal(T)
+    log = gc.Recording.of(t, {"x": shown, "y": x + 1e-4 * rng.standard_normal(T), "u": u[:, 0], "w": 0 * t}, hold="zero")
+    library, windows = prepared(equations(WAYS), log, [find("sensor-delay")])
+    sets = FittedSets(library, windows)
+    (late,) = (c for c in library.candidates if c.site == "x")
+    assert library.starts(late).min() * gains.THRESHOLDS.nonlinear_gain[0] > 2 * seconds
+    assert sets.promise(((), sets.nothing), late).gain > 100
+    assert sets.fit((late,), ((), sets.nothing)).values["sensor_delay_x"] == pytest.approx(seconds, rel=0.05)

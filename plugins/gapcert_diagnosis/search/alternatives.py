@@ -202,7 +202,16 @@ def _alternatives(search: FittedSets, whole: FittedSets, found: Found, c: Candid
     short = bool(tried) and all(keys(s) in search.lost for s, _ in tried)
     groups = [rank(g, search.cautious) for g in ((tried, kin) if short else ([*tried, *kin],))]
     near = [f for g in groups for i, f in enumerate(g) if i == 0 or search.better(found[1], f[1]) < THRESHOLDS.far_rival]
-    return tuple(rank([(s, whole.fit_from(s, f)) for s, f in near], search.cautious))
+    return tuple(rank([(s, _plainer(whole, found[0], c, s, whole.fit_from(s, f))) for s, f in near], search.cautious))
+
+
+def _plainer(whole: FittedSets, causes: Causes, c: Candidate, new: Causes, fitted: Fit) -> Fit:
+    """The fit of a rival; where c contains it and leaves less, from the numbers of c too: kinks hold up fits from elsewhere."""
+    last, (e, *_) = whole.known(causes), without(new, causes)
+    told = c.effect.contains.get(e.effect.name) if e.site == c.site else None
+    if last is None or not told or whole.better(last, fitted) < THRESHOLDS.richer_score:
+        return fitted
+    return whole.fit_again(new, (causes, last), whole.carry(c, e, (causes, last), default=False))
 
 
 def _relatives(search: FittedSets, base: Found, c: Candidate) -> list[Causes]:

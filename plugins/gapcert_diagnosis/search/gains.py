@@ -128,9 +128,7 @@ class GainTable:
         curve = curve - np.einsum("gi,ij,gj->g", cross, self.inverse, cross)
         slope = cross @ self.inverse @ self.along - (rows.T @ self.residual)[:, 0]
         limits = np.array([self._bounds(p.candidate, v) for p in pushes for v in p.values])
-        usable = curve > 1e-9
-        a = np.clip(np.divide(slope, curve, out=np.zeros_like(slope), where=usable), limits[:, 0], limits[:, 1])
-        gain = np.where(usable, 2 * a * slope - a**2 * curve, 0.0)
+        a, gain = _alone(slope, curve, limits, curve > 1e-9)
         ends = np.cumsum([0, *(len(p.values) for p in pushes)])
         for p, k, n in zip(pushes, ends[:-1], ends[1:], strict=True):
             new = Column(p.values, rows[:, k:n], seen[:, k:n], a[k:n], gain[k:n], curve[k:n])
@@ -150,13 +148,17 @@ class GainTable:
         if len(move) > 1:
             gain, multiples = self._together(move, best)
         found: dict[str, float] = {}
-        for c, i, a in zip(move, best, multiples, strict=True):
-            k, start = self.library.amplitude(c), self.columns[c.key].values[i].copy()
-            if k is not None:
-                off = self.library.off(c)[k]
-                start[k] = off + a * (start[k] - off)
-            found |= dict(zip(self.library.names(c), start.tolist(), strict=True))
+        for own in zip(move, best, multiples, strict=True):
+            found |= self._times(*own)
         return Promise(move, found, max(gain, 0.0))
+
+    def _times(self, c: Candidate, i: int, a: float) -> dict[str, float]:
+        """The numbers of a candidate's start, a times as large where it is linear in one."""
+        k, start = self.library.amplitude(c), self.columns[c.key].values[i].copy()
+        if k is not None:
+            off = self.library.off(c)[k]
+            start[k] = off + a * (start[k] - off)
+        return dict(zip(self.library.names(c), start.tolist(), strict=True))
 
     def pursue(self, most: int) -> list[Promise]:
         """Sets of 1, 2, … candidates, each next one the one that promises most beside those before it."""
@@ -225,6 +227,28 @@ class GainTable:
             gain[np.outer(alike[i], alike[j]) | np.outer(alike[j], alike[i])] = 0.0
         return found
 
+    def loosened_pairs(self) -> list[Promise]:
+        """Each stated number without its prior, and the candidate that promises most beside it.
+
+        What a law leaves may be held by that prior so firmly that neither the law nor the number helps without the other.
+        """
+        e, found = self.all_columns(), list[Promise]()
+        cross = e.rows.T @ self.slopes
+        own = np.einsum("ij,ij->j", e.rows, e.rows) - np.einsum("ij,ij->j", e.seen, e.seen)
+        for c in self.library.candidates:
+            if self.library.loosened(c) is None or not e.known or (freed := self._freed(c)) is None:
+                continue
+            k = self.fit.hypothesis.names.index(self.library.names(c)[0])
+            inverse, along = self._loosened(k)
+            curve = own - np.einsum("ij,ij->i", cross @ inverse, cross)
+            slope = cross @ inverse @ along - (e.rows.T @ self.residual)[:, 0]
+            a, gain = _alone(slope, curve, e.limits, curve > 1e-9)
+            i = int(np.argmax(gain))
+            law, moved = e.known[int(e.owner[i])], float((inverse @ (along + cross[i] * a[i]))[k])
+            values = self._times(law, int(e.inner[i]), float(a[i])) | self._within(c, k, moved)
+            found.append(Promise((law, c), values, freed.gain + max(float(gain[i]), 0.0)))
+        return found
+
     def _normal_equations(self, rows: Array, seen: Array) -> tuple[Array, Array]:
         """Curvatures (K, K) and slopes (K,) of columns, without what starts and free numbers make of them."""
         cross = rows.T @ self.slopes
@@ -249,10 +273,13 @@ class GainTable:
         return np.array([self.fit.hypothesis.value[k] + scale * np.sqrt(1 / self.precision[k] + left)])
 
     def _bounds(self, c: Candidate, values: Array) -> tuple[float, float]:
-        k = self.library.amplitude(c)
+        k, offs = self.library.amplitude(c), self.library.off(c)
         if k is None:
-            return THRESHOLDS.nonlinear_gain
-        off = self.library.off(c)[k]
+            low, high = THRESHOLDS.nonlinear_gain
+            # Less than the least start of a single number does in proportion less.
+            least = len(offs) == 1 and abs(values[0] - offs[0]) <= np.abs(self.library.starts(c) - offs).min()
+            return 0.0 if least else low, high
+        off = offs[k]
         low, high = (float((b[k] - off) / (values[k] - off)) for b in self.library.bounds(c))
         return min(low, high), max(low, high)
 
@@ -272,13 +299,21 @@ class GainTable:
         if name not in self.fit.hypothesis.names:
             return None
         k = self.fit.hypothesis.names.index(name)
+        inverse, along = self._loosened(k)
+        move = inverse @ along
+        gain = self.precision[k] * self.off[k] ** 2 + along @ move - self.along @ self.inverse @ self.along
+        return Promise((c,), self._within(c, k, float(move[k])), max(float(gain), 0.0))
+
+    def _loosened(self, k: int) -> tuple[Array, Array]:
+        """(inverse, slopes) of the free numbers where the k-th has no prior."""
         precision, along, pinned = self.precision.copy(), self.along.copy(), self.pinned.copy()
         precision[k], along[k], pinned[k] = 0.0, self.pull[k], False
-        move = self._inverse(precision, pinned) @ along
-        gain = self.precision[k] * self.off[k] ** 2 + along @ move - self.along @ self.inverse @ self.along
+        return self._inverse(precision, pinned), along
+
+    def _within(self, c: Candidate, k: int, move: float) -> dict[str, float]:
         # A straight line says little about a value that is far off; a fit from half or twice the stated one finds it.
         low, high = np.sort(self.fit.hypothesis.value[k] * np.array(THRESHOLDS.freed_values))
-        return Promise((c,), {name: float(np.clip(self.fit.theta[k] - move[k], low, high))}, max(float(gain), 0.0))
+        return {self.library.names(c)[0]: float(np.clip(self.fit.theta[k] - move, low, high))}
 
     def _rows(self, state: Array | None, output: Array | None) -> Array:
         """What pushes (W, S, nx, K) and differences of the output (W, L, ny, K) do to the residual, (W', blocks·ny, K)."""
@@ -333,10 +368,7 @@ class MatchingPursuit:
 
     def gains(self) -> Array:
         """What each column (K,) promises beside those that are taken: nothing, if it is alike or at odds with one of them."""
-        usable, limits = self.open & (self.curve > self.least), self.columns.limits
-        a = np.divide(self.slope, self.curve, out=np.zeros_like(self.slope), where=usable)
-        a = np.clip(a, limits[:, 0], limits[:, 1])
-        return np.where(usable, 2 * a * self.slope - a**2 * self.curve, 0.0)
+        return _alone(self.slope, self.curve, self.columns.limits, self.open & (self.curve > self.least))[1]
 
     def best(self) -> int | None:
         """The column that promises most; of laws that contain one another the simplest that promises nearly as much."""
@@ -358,6 +390,12 @@ class MatchingPursuit:
         # Not twice the same law at one site.
         at_odds = np.array([self.library.related(k, c) for k in e.known])
         self.open = self.open & ~at_odds[e.owner]
+
+
+def _alone(slope: Array, curve: Array, limits: Array, usable: npt.NDArray[np.bool_]) -> tuple[Array, Array]:
+    """(multiples, gains) of columns (K,), each for itself and in its bounds."""
+    a = np.clip(np.divide(slope, curve, out=np.zeros_like(slope), where=usable), limits[:, 0], limits[:, 1])
+    return a, np.where(usable, 2 * a * slope - a**2 * curve, 0.0)
 
 
 def _both(curve: Array, slope: Array, low: Array, high: Array) -> Array:

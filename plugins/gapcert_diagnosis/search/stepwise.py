@@ -167,7 +167,8 @@ class EquationSearch:
         if keys(found[0]) == self.piled:
             return found  # of all candidates at once, and noise is left
         sets, nothing, now = self.sets, self.nothing, self.sets.brief(found)
-        promised = [s for table in sets.screen.tables(sets.fits(nothing)) for s in table.pairs(THRESHOLDS.paired_short_fits)]
+        tables, few = sets.screen.tables(sets.fits(nothing)), THRESHOLDS.paired_short_fits
+        promised = [s for table in tables for s in (*table.pairs(few), *table.loosened_pairs())]
         most = max((s.gain for s in promised), default=0.0)
         silent = noise(found[1], THRESHOLDS.sure_errors) and bool(found[0])
         if most < (THRESHOLDS.paired_share * self._explained(found[1]) if silent else 2 * sets.library.charge()):
