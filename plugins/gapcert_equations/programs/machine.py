@@ -259,7 +259,8 @@ class Compiled:
         late, past, lines, values = self._prepared(first, u, parameters, hidden)
         before = past[:, lines[2].shape[1] :]
         start = np.concatenate([first, before], axis=1)
-        at, back = np.asarray(stops, dtype=np.int64), known.any(axis=(0, 2)).astype(np.int64)
+        at: Codes = np.asarray(stops, dtype=np.int64)
+        back: Codes = np.asarray(known.any(axis=(0, 2)), dtype=np.int64)
         program = self.program.recall or self.program
         x, _ = run(program, start, u, values, lines, self.substeps, at, start.shape[1], path, back)
         explicit = x[:, :, self.nx :]
