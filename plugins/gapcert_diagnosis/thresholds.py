@@ -114,7 +114,6 @@ class Thresholds:
     history_shots: int = decides(3, "rounds of shooting through the history of a window: it is short, and nearly linear")
     history_cutoff: float = chosen(1e-3, "relative singular value below which a history does not tell a state")
     first_samples: int = chosen(20, "of a recording, at least, that tell whether its first input acted before it began")
-    held_parts: int = chosen(16, "of a log, the next ones twice as long, until what is remembered stands still")
     begun_windows: int = chosen(3, "of a piece, that tell what acted before it: what is remembered fades")
     begun_values: int = chosen(7, "between an input's least and largest, that are tried as what acted before a piece")
     begun_rounds: int = chosen(3, "times that a fit is made again with what acted before its pieces")

@@ -147,6 +147,7 @@ class EngineModel(Model):
     fast_rollout: Any = partialmethod(_asked, "fast_rollout")
     along: Any = partialmethod(_asked, "along")
     fast_memories: Any = partialmethod(_asked, "fast_memories")
+    held_memories: Any = partialmethod(_asked, "held_memories")
     jacobian: Any = partialmethod(_asked, "jacobian")
     enclosure: Any = partialmethod(_asked, "enclosure")
     jacobian_enclosure: Any = partialmethod(_asked, "jacobian_enclosure")

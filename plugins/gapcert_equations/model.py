@@ -122,20 +122,25 @@ class EquationsModel(Model):
         self, x0: Array, u: Array, *, parameters: Values | None = None, hidden: Array | None = None, every: int = 1
     ) -> Step:
         """By the compiled interpreter where numba is installed, else as every model does it."""
-        if (compiled := self._compiled()) is None:
+        if (compiled := self._compiled) is None:
             return super().fast_rollout(x0, u, parameters=parameters, hidden=hidden, every=every)
         return compiled.rollout(x0, u, parameters or {}, hidden, every)
 
     def along(self, x: Array, u: Array, *, parameters: Values | None = None, hidden: Array | None = None) -> Array:
         """By the compiled interpreter where numba is installed, else as every model does it."""
-        if not x.size or (compiled := self._compiled()) is None:
+        if not x.size or (compiled := self._compiled) is None:
             return super().along(x, u, parameters=parameters, hidden=hidden)
         return np.asarray(compiled.rollout(x[:, 0], u, parameters or {}, hidden, path=x).x[:, 1:])
 
     def fast_memories(self, path: Array, u: Array, stops: Sequence[int], parameters: Values, hidden: Array) -> Array | None:
         """By the compiled interpreter where numba is installed."""
-        return None if (compiled := self._compiled()) is None else compiled.memories(path, u, stops, parameters, hidden)
+        return None if (compiled := self._compiled) is None else compiled.memories(path, u, stops, parameters, hidden)
 
+    def held_memories(self, x: Array, u: Array, steps: int, parameters: Values, hidden: Array) -> Array | None:
+        """By the compiled interpreter where numba is installed."""
+        return None if (compiled := self._compiled) is None else compiled.held(x, u, steps, parameters, hidden)
+
+    @cached_property
     def _compiled(self) -> Compiled | None:
         if importlib.util.find_spec("numba") is None:
             return None

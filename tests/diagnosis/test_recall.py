@@ -8,7 +8,6 @@ import pytest
 import gapcert as gc
 from gapcert.testing import multisine
 from gapcert_diagnosis.data.dataset import Dataset
-from gapcert_diagnosis.fitting import hypothesis
 from gapcert_diagnosis.fitting.fit import fit
 from gapcert_diagnosis.fitting.hypothesis import Hypothesis, recalled
 from gapcert_diagnosis.search.candidates import Candidate, Library
@@ -98,28 +97,6 @@ def test_the_fast_way_is_that_of_rollouts_from_mark_to_mark(effects, monkeypatch
     monkeypatch.setattr(type(extended), "fast_memories", gc.Model.fast_memories)
     np.testing.assert_allclose(fast, recalled(extended, windows, numbers, 3), rtol=1e-9, atol=1e-12)
     assert np.ptp(fast, axis=0).max() > 0
-
-
-@pytest.mark.parametrize(("name", "site", "numbers"), [("input-lag", "u", {"value": 0.02}), ("dahl-friction", "q", None)])
-def test_what_acted_before_a_log_is_found_part_by_part_as_in_one_pass(name, site, numbers, monkeypatch):
-    cart = equations(CART)
-    model = cart.extend([gc.registry().build("effect", name).extension(site, cart)])
-    t = np.arange(900) * PERIOD
-    u, values = 1.0 + 0.2 * np.sin(3 * t), {"input_lag_u": numbers["value"]} if numbers else {}
-    measured = Dataset.of(cart, gc.Recording.of(t, {"q": np.sin(2 * t), "u": u}))
-    found, steps, memories = [], [0], type(model).fast_memories
-
-    def counted(self, path, u, stops, *given):
-        steps[-1] += u.shape[1]
-        return memories(self, path, u, stops, *given)
-
-    monkeypatch.setattr(type(model), "fast_memories", counted)
-    for parts in (hypothesis.THRESHOLDS.held_parts, 1):
-        monkeypatch.setattr(hypothesis, "THRESHOLDS", replace(hypothesis.THRESHOLDS, held_parts=parts))
-        found.append(recalled(model, measured.windows(60), values, 1))
-        steps.append(0)
-    np.testing.assert_allclose(found[0], found[1], rtol=1e-12)
-    assert steps[0] < steps[1]
 
 
 def test_what_is_known_of_the_past_is_not_found_again_and_counts():

@@ -162,6 +162,29 @@ def test_steps_along_a_given_motion(spec):
     np.testing.assert_allclose(fast, gc.Model.along(model, x, u, parameters=values, hidden=hidden), rtol=1e-12, atol=1e-13)
 
 
+def test_held_inputs_leave_behind_what_steps_do_and_the_run_ends_once_that_stands_still():
+    worn = {"unit": "rad", "next": "worn + h*b_dot"}  # the motion bends it, with or without an input
+    rest = {"unit": "N*m", "next": "rest + (1 - exp(-h/tau))*(u + w*cos(b) - rest)"}
+    clock = {"unit": "s", "next": "clock + h"}
+    model = build(SLOW, memory=SLOW["memory"] | {"worn": worn, "rest": rest, "clock": clock})
+    rng = np.random.default_rng(5)
+    x, u, tau = rng.normal(size=(2, 4)), rng.normal(size=(2, 2)), np.array([0.02, 0.03, 0.02, 0.05, 0.04, 0.03])
+    begun = np.tile(model.hidden_default, (6, 1))
+    kept = [n for n, s in enumerate(model.hidden) if s.name in ("slow", "worn", "clock")]  # `slow` fades by itself
+    for steps in (3, 40):
+        found, now, values = model.held_memories(x, u, steps, {"tau": tau}, begun), begun, {"tau": tau}
+        for _ in range(steps):
+            now = model.step(np.tile(x, (3, 1)), np.tile(u, (3, 1)), parameters=values, hidden=now).hidden
+        np.testing.assert_array_equal(found[:, kept], begun[:, kept])
+        np.testing.assert_allclose(np.delete(found, kept, 1), np.delete(now, kept, 1), rtol=1e-12)
+    long, longer = (model.held_memories(x, u, steps, {"tau": tau}, begun) for steps in (2000, 10**9))
+    np.testing.assert_array_equal(long, longer)
+    # A program of memories alone leaves out what they do not rest on.
+    alone = build(SLOW).program
+    assert (alone.recall.new[:4] == alone.recall.states[:4]).all()
+    assert len(alone.recall.code[SUBSTEP]) < len(alone.code[SUBSTEP]) / 5
+
+
 @pytest.mark.parametrize("spec", [ARM, SLOW])
 def test_without_numba_the_answers_are_the_same(spec, monkeypatch):
     model = build(spec)
@@ -171,6 +194,7 @@ def test_without_numba_the_answers_are_the_same(spec, monkeypatch):
     fast = model.fast_rollout(x0, u, parameters=values, hidden=hidden, every=3), model.along(x, inputs, hidden=hidden)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     monkeypatch.setattr("gapcert_equations.programs.machine.run", None)
+    model = build(spec)
     agree(fast[0], model.fast_rollout(x0, u, parameters=values, hidden=hidden, every=3))
     np.testing.assert_allclose(fast[1], model.along(x, inputs, hidden=hidden), rtol=1e-12, atol=1e-13)
 

@@ -349,11 +349,8 @@ def recalled(
     out = _defaults(model, count, windows.t - windows.measured.history * windows.measured.period)
     if model.remembers:
         if windows not in _WAYS:
-            first = windows.place[:, 1] - windows.measured.history
-            rows = {piece: np.flatnonzero(windows.place[:, 0] == piece) for piece in np.unique(windows.place[:, 0]).tolist()}
-            _WAYS[windows] = _Way(windows.measured, rows, {p: first[r] for p, r in rows.items()})
-        for piece, hidden in _Past(model, _WAYS[windows], parameters, count, acted).found().items():
-            out[:, _WAYS[windows].rows[piece]] = hidden
+            _WAYS[windows] = _Way(windows.measured, windows.place[:, 0], windows.place[:, 1] - windows.measured.history)
+        out = _Past(model, _WAYS[windows], parameters, count, acted).found()
     _commanded(model, windows, out, acted)
     return out.reshape(count * len(windows), -1)
 
@@ -381,20 +378,33 @@ def _defaults(model: Model, count: int, t: Array) -> Array:
 @final
 @dataclass(frozen=True)
 class _Way:
-    """The measured motion of all pieces, onto which models are put back every `free_stretch` and at their stops (piece →
-    samples).
+    """The measured motion of all pieces, onto which models are put back every `free_stretch` and where windows begin.
 
-    rows: piece → the windows that begin in it. It is the same for every model and all its numbers.
+    piece, first (W,): where these begin. It is the same for every model and all its numbers.
     """
 
     measured: Dataset
-    rows: Mapping[int, npt.NDArray[np.intp]]
-    stops: Mapping[int, Array]
+    piece: npt.NDArray[np.int64]
+    first: npt.NDArray[np.int64]
+
+    @cached_property
+    def stops(self) -> dict[int, Array]:
+        return {p: self.first[self.piece == p] for p in np.unique(self.piece).tolist()}
 
     @cached_property
     def pieces(self) -> list[int]:
         """Those that end last come first."""
         return sorted(self.stops, key=lambda p: -int(self.stops[p].max()))
+
+    @cached_property
+    def place(self) -> tuple[list[int], Array]:
+        """Where windows begin, among the pieces and among the marks."""
+        return [self.pieces.index(p) for p in self.piece.tolist()], np.searchsorted(self.marks, self.first)
+
+    @cached_property
+    def begun(self) -> Array:
+        """Times (pieces,) of the first samples."""
+        return np.array([self.measured.times[p][0] for p in self.pieces])
 
     @cached_property
     def own(self) -> list[set[int]]:
@@ -425,7 +435,7 @@ class _Way:
         return path, u
 
     @cached_property
-    def first(self) -> tuple[Array, Array, Array]:
+    def head(self) -> tuple[Array, Array, Array]:
         """The first samples of every piece: states (pieces, n, nx), inputs (pieces, steps, nu); and spreads of the states."""
         m, pieces = self.measured, self.pieces
         few = min(max(THRESHOLDS.first_samples, m.samples(THRESHOLDS.free_stretch)), *(len(m.states[p]) - 1 for p in pieces))
@@ -448,10 +458,10 @@ class _Past:
     count: int
     acted: Acted = field(default_factory=dict)
 
-    def found(self) -> dict[int, Array]:
-        """Per piece, hidden states (count, stops, nh)."""
-        known, way = self._at_once() or self._stepwise(), self.way
-        return {p: np.stack([known[s][:, i] for s in way.stops[p].tolist()], axis=1) for i, p in enumerate(way.pieces)}
+    def found(self) -> Array:
+        """Hidden states (count, W, nh) where windows begin."""
+        known, (piece, mark) = self._at_once(), self.way.place
+        return (self._stepwise() if known is None else known)[:, piece, mark]
 
     @cached_property
     def start(self) -> Array:
@@ -459,72 +469,64 @@ class _Past:
 
         A machine that is just switched on, or at an operating point: the first samples tell, where it is not known what acted.
         """
-        first = [self.way.measured.times[p][0] for p in self.way.pieces]
-        hidden = _defaults(self.model, self.count, np.array(first))
-        given = [self.acted.get(self.way.measured.beginning(p)) for p in self.way.pieces]
-        u = np.stack([a if b is None else b for a, b in zip(self.way.path[1][:, 0], given, strict=True)])[:, None]
+        hidden, u = _defaults(self.model, self.count, self.way.begun), self.way.path[1][:, 0].copy()
+        held = np.zeros(len(u), dtype=bool)
+        for i, p in enumerate(self.way.pieces if self.acted else ()):
+            if (given := self.acted.get(self.way.measured.beginning(p))) is not None:
+                u[i], held[i] = given, True
         if not u.any():
             return hidden
         settled = self._settled(u, hidden)
         if np.array_equal(settled, hidden):
             return hidden
-        held = np.array([b is not None for b in given])
-        held = held if held.all() else held | np.less(*self._missed(np.stack([settled, hidden], axis=1)))
-        return np.where(np.broadcast_to(held, hidden.shape[:2])[..., None], settled, hidden)
+        if not held.all():
+            held = held | np.less(*self._missed(np.stack([settled, hidden], axis=1)))
+        return np.where(held[..., None], settled, hidden)
 
     def _settled(self, u: Array, hidden: Array) -> Array:
-        """What is remembered where the first state, and inputs (pieces, 1, nu), have been held for as long as the log is.
+        """What is remembered where the first state, and inputs u (pieces, nu), have been held for as long as the log is.
 
-        It is gone through in growing parts until nothing moves; what moves without an input is bent by the motion, which was
-        another one before.
+        What moves without an input is bent by the motion, which was another one before.
         """
-        way, rows, shape = self.way, self._rows(2 * len(u)), (self.count, 2, *hidden.shape[1:])
-        path, u = np.tile(way.path[0][:, :1], (2, 1, 1)), np.concatenate([u, 0 * u])
-        now, left = np.tile(hidden[:, None], (1, 2, 1, 1)), max(len(way.measured.driven[p]) for p in way.pieces) - 1
-        # A state that no channel shows would begin anew with every part.
-        part, moving = left if way.blind.any() else -(-left // THRESHOLDS.held_parts), True
-        while left > 0 and moving:
-            part, given = min(part, left), now.reshape(-1, hidden.shape[2])
-            x, drive = (np.repeat(a, part, axis=1) for a in (path, u))
-            if (found := self.model.fast_memories(x, drive, [part // 2, part], rows, given)) is None:
-                begun, drive = np.tile(np.nan_to_num(path[:, 0]), (self.count, 1)), np.repeat(u, left, axis=1)
-                found = self.model.fast_rollout(begun, drive, parameters=rows, hidden=given, every=left).hidden
-                now, moving = now if found is None else found.reshape(shape), False
-                continue
-            before, now = (found[:, k].reshape(shape) for k in (0, 1))
-            moving = bool(((before[:, 0] != now[:, 0]) & (now[:, 1] == hidden)).any())
-            left, part = left - part, 2 * part
-        settled, plain = now[:, 0], now[:, 1]
-        return np.where(np.isfinite(settled) & (plain == hidden), settled, hidden)
+        way, rows, given = self.way, self._rows(len(u)), hidden.reshape(-1, hidden.shape[2])
+        x, steps = way.path[0][:, 0], max(len(way.measured.driven[p]) for p in way.pieces) - 1
+        found = self.model.held_memories(x, u, steps, rows, given) if steps > 0 else given
+        if found is None:
+            begun, drive = np.tile(np.nan_to_num(x), (self.count, 1)), np.repeat(u[:, None], steps, axis=1)
+            settled, plain = (
+                self.model.fast_rollout(begun, v, parameters=rows, hidden=given, every=steps).hidden for v in (drive, 0 * drive)
+            )
+            found = given if settled is None else np.where(np.isfinite(settled) & (plain == given), settled, given)
+        return found.reshape(hidden.shape)
 
     def _missed(self, hidden: Array) -> Array:
         """Squares (k, count, pieces) by which the first samples are missed from hidden states (count, k, pieces, nh) on, in
         spreads of the states."""
-        (seen, u, spread), k = self.way.first, hidden.shape[1]
-        seen, rows = np.tile(seen, (self.count * k, 1, 1)), self._rows(k * len(u))
+        (seen, u, spread), k = self.way.head, hidden.shape[1]
+        begun, rows = np.tile(seen[:, 0], (self.count * k, 1)), self._rows(k * len(u))
         with np.errstate(all="ignore"):
             given = hidden.reshape(-1, hidden.shape[3])
-            moved = self.model.fast_rollout(seen[:, 0], u, parameters=rows, hidden=given, every=self.way.measured.repeat).x
-            off = difference(self.model.states, moved, seen) / spread
-        missed = np.sum(np.where(self.way.blind, 0.0, off) ** 2, axis=(1, 2))
-        return np.asarray(np.nan_to_num(missed, nan=np.inf).reshape(hidden.shape[:3]).swapaxes(0, 1))
+            moved = self.model.fast_rollout(begun, u, parameters=rows, hidden=given, every=self.way.measured.repeat).x
+            off = difference(self.model.states, moved.reshape(*hidden.shape[:3], *seen.shape[1:]), seen) / spread
+        off[..., self.way.blind] = 0.0
+        return np.asarray(np.nan_to_num((off**2).sum(axis=(3, 4)), nan=np.inf).swapaxes(0, 1))
 
     def _rows(self, pieces: int) -> dict[str, Array | float]:
         return {n: np.repeat(v, pieces) if np.ndim(v) else v for n, v in self.parameters.items()}
 
-    def _at_once(self) -> dict[int, Array] | None:
-        """Mark → hidden states (count, pieces, nh), where the model knows a way."""
+    def _at_once(self) -> Array | None:
+        """Hidden states (count, pieces, marks, nh), where the model knows a way."""
         way, (path, u) = self.way, self.way.path
         hidden = self.start.reshape(self.count * len(way.pieces), -1)
         stops = [a * way.measured.repeat for a in way.marks]
         found = self.model.fast_memories(path, u, stops, self._rows(len(way.pieces)), hidden)
-        return None if found is None else {a: found[:, k].reshape(self.start.shape) for k, a in enumerate(way.marks)}
+        return None if found is None else found.reshape(*self.start.shape[:2], *found.shape[1:])
 
-    def _stepwise(self) -> dict[int, Array]:
+    def _stepwise(self) -> Array:
         """The same, by rollouts from mark to mark; pieces that end first leave first."""
         way, m, hidden = self.way, self.way.measured, self.start
         last = np.array([way.stops[p].max() for p in way.pieces])
-        known, x = {0: hidden}, np.tile([m.states[p][0] for p in way.pieces], (self.count, 1, 1))
+        known, x = [hidden], np.tile([m.states[p][0] for p in way.pieces], (self.count, 1, 1))
         for a, b in itertools.pairwise(way.marks):
             here = way.pieces[: int(np.count_nonzero(last >= b))]
             w, steps = len(here), (b - a) * m.repeat
@@ -541,5 +543,5 @@ class _Past:
             assert moved.hidden is not None
             new = moved.hidden.reshape(hidden.shape)
             x, hidden = moved.x[:, -1].reshape(x.shape), np.where(np.isfinite(new), new, hidden)
-            known[b] = hidden
-        return known
+            known.append(np.concatenate([hidden, known[-1][:, w:]], axis=1))
+        return np.stack(known, axis=2)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, final
 
@@ -35,7 +35,8 @@ class Program:
     """Instructions (operation, target, up to four operands) of three parts: per rollout, per period and per sub-step.
 
     Registers: `constants` with their values, `parameters`, `inputs`, `states`; `new[i]` is copied to `states[i]` after every
-    sub-step. `extra` holds the operand lists of operations with many.
+    sub-step. `extra` holds the operand lists of operations with many. recall: the same for what is remembered alone; states
+    that it does not rest on, not even through others, stay where they are.
     """
 
     code: tuple[Codes, Codes, Codes]
@@ -47,6 +48,7 @@ class Program:
     inputs: Codes
     states: Codes
     new: Codes
+    recall: Program | None = None
 
     @cached_property
     def held(self) -> frozenset[int]:
@@ -123,6 +125,16 @@ class Graph:
         self.known.clear()
         self.symbols.clear()
 
+    def reachable(self, indices: Sequence[int]) -> set[int]:
+        """All that these are computed from."""
+        live, open_ = set(), list(indices)
+        while open_:
+            i = open_.pop()
+            if i not in live:
+                live.add(i)
+                open_ += self.nodes[i][1]
+        return live
+
     def _simpler(self, name: str, indices: tuple[int, ...]) -> Symbol | None:
         """The same value with fewer or cheaper operations; divisions by what does not vary become products."""
         given = [self.constant.get(i) for i in indices]
@@ -168,7 +180,7 @@ class Assembler:
 
     def __init__(self, graph: Graph, results: Sequence[Symbol]) -> None:
         self.graph, self.results = graph, [r.index for r in results]
-        self.live = self._reachable()
+        self.live = graph.reachable(self.results)
         self.uses = self._counted()
         self.fused = self._products()
         self.pairs = self._pairs()
@@ -204,15 +216,6 @@ class Assembler:
             registers([s.index for s in states]),
             np.array(new, dtype=np.int64),
         )
-
-    def _reachable(self) -> set[int]:
-        live, open_ = set(), list(self.results)
-        while open_:
-            i = open_.pop()
-            if i not in live:
-                live.add(i)
-                open_ += self.graph.nodes[i][1]
-        return live
 
     def _counted(self) -> dict[int, int]:
         uses = dict.fromkeys(self.live, 0)
@@ -350,5 +353,17 @@ def _traced(graph: Graph, dynamics: Dynamics, parameters: int, states: int, inpu
         new, kept = once.step(operations, once.prepare(operations, p), x, u, z)
     results = [r if isinstance(r, Symbol) else graph.number(r) for r in (*new, *kept)]
     program = Assembler(graph, results).program(p, u, [*x, *z])
+    if z:
+        alone = _recalling(graph, results, [*x, *z], states)
+        program = replace(program, recall=Assembler(graph, alone).program(p, u, [*x, *z]))
     graph.close()
     return program
+
+
+def _recalling(graph: Graph, results: list[Symbol], leaves: list[Symbol], states: int) -> list[Symbol]:
+    """Results, with states that those behind the first `states` do not rest on unmoved."""
+    seen, known = set(range(states, len(leaves))), -1
+    while len(seen) > known:
+        known, live = len(seen), graph.reachable([results[i].index for i in seen])
+        seen |= {i for i, leaf in enumerate(leaves) if leaf.index in live}
+    return [r if i in seen else leaf for i, (r, leaf) in enumerate(zip(results, leaves, strict=True))]

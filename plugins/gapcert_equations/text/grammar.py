@@ -76,7 +76,7 @@ def parse(text: str) -> ast.expr:
     except (ValueError, MemoryError, RecursionError):
         raise ExpressionError("the expression is nested too deeply; write it flatter") from None
     encoded = source.encode()
-    for node in ast.walk(tree):
+    for node in ast.walk(tree) if lead or len(encoded) > len(source) else ():
         if isinstance(node, ast.expr):
             node.col_offset = lead + len(encoded[: node.col_offset].decode())
     _check(tree, 0)
@@ -159,9 +159,18 @@ def constant(node: ast.expr) -> float | None:
 @functools.lru_cache(maxsize=1 << 14)
 def names(tree: ast.expr) -> tuple[tuple[str, int], ...]:
     """(name, offset) of every variable, in the order of the text; functions and pi are none."""
-    functions = {id(n.func) for n in ast.walk(tree) if isinstance(n, ast.Call)}
-    found = [n for n in ast.walk(tree) if isinstance(n, ast.Name) and id(n) not in functions and n.id != "pi"]
-    return tuple(sorted(((n.id, n.col_offset) for n in found), key=lambda item: item[1]))
+    found, open_ = list[tuple[str, int]](), [tree]
+    while open_:
+        node = open_.pop()
+        if isinstance(node, ast.BinOp):
+            open_ += (node.left, node.right)
+        elif isinstance(node, ast.UnaryOp):
+            open_.append(node.operand)
+        elif isinstance(node, ast.Call):
+            open_ += node.args
+        elif isinstance(node, ast.Name) and node.id != "pi":
+            found.append((node.id, node.col_offset))
+    return tuple(sorted(found, key=lambda item: item[1]))
 
 
 def check_names(tree: ast.expr, known: Iterable[str]) -> None:

@@ -469,6 +469,14 @@ class Model(System, Extendable, EngineHints):
         """
         return None
 
+    def held_memories(self, x: Array, u: Array, steps: int, parameters: Values, hidden: Array) -> Array | None:
+        """Hidden states (n, nh) after `steps` under inputs u (w, nu) at states x (w, nx), from hidden (n, nh), w dividing n.
+
+        States that are not finite go on from zero. What moves without an input as well, or blows up, is what it was. None: see
+        `fast_memories`.
+        """
+        return None
+
     def output_delays(self, parameters: Values | None = None) -> Array:
         """Seconds by which each output shows the past, (ny,), or (n, ny) for parameters (n,); `output` does not apply them."""
         return np.zeros((*np.broadcast_shapes(*(np.shape(v) for v in (parameters or {}).values())), len(self.outputs)))
