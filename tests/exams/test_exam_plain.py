@@ -200,3 +200,10 @@ def test_what_is_promised_of_an_experiment_is_found_when_it_is_played():
     assert score.resolved(r)
     assert r["beyond"] < 0.02
     assert all(p["found"] == pytest.approx(p["promised"], rel=0.3) for p in r["apart"])
+
+
+@pytest.mark.exam
+def test_a_curve_gives_way_to_a_lag_that_no_screen_shows_beside_a_push():
+    said = plain.ask(plain.pair("plain-pairs", 5103, 3), 300.0)
+    assert said["verdict"] == "causes"
+    assert {c["effect"] for c in said["causes"]} == {"external-push", "input-lag"}

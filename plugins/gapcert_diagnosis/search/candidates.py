@@ -317,6 +317,11 @@ class Library:
         """Does one law contain another that is dry or remembers?"""
         return self.contains(a.effect.name, b.effect.name) and bool(self.dry((b,)) or self.extension(b).memory)
 
+    def remembers(self, c: Candidate) -> bool:
+        """Is it a law of an input that knows its past?"""
+        e = self.extension(c)
+        return c.effect.site == "input" and bool(e.memory or e.delay)
+
     def dry(self, causes: Causes) -> tuple[str, ...]:
         """Parameters of dry friction among them."""
         return tuple(n for c in causes if self.extension(c).dry_friction is not None for n in self.names(c))

@@ -140,13 +140,9 @@ def stuck(sets: FittedSets, causes: Causes, but: Collection[Keys]) -> list[Promi
 def blunted(sets: FittedSets, base: Found) -> list[Promise]:
     """What else remembers on the way of an input where something does already: that blunts what a screen expects of it."""
     library, (causes, now) = sets.library, base
-
-    def remembers(c: Candidate) -> bool:
-        e = library.extension(c)
-        return c.effect.site == "input" and bool(e.memory or e.delay)
-
-    sites = set() if noise(now) else {c.site for c in causes if remembers(c)}
-    return _unscreened(sets, base, [c for c in library.candidates if c.site in sites and remembers(c) and c not in causes])
+    sites = set() if noise(now) else {c.site for c in causes if library.remembers(c)}
+    late = [c for c in library.candidates if c.site in sites and library.remembers(c) and c not in causes]
+    return _unscreened(sets, base, late)
 
 
 def _unscreened(sets: FittedSets, base: Found, candidates: Sequence[Candidate]) -> list[Promise]:
@@ -248,6 +244,24 @@ def _swapped(sets: FittedSets, found: Found, where: Causes, e: Candidate) -> Opt
     for k in where if sets.known(new) is None else ():
         start |= sets.carry(k, at[k.site], found) if k.site in at else {}
     return new, start
+
+
+def remembered(sets: FittedSets, found: Found) -> list[Option]:
+    """Where no noise is left, a law of an input that remembers in the place of one that does not, which no screen shows.
+
+    Of each cause the one that leaves least at its best first values.
+    """
+    library, (causes, now), out = sets.library, found, list[Option]()
+    for c in () if noise(now) or now.chi.max() > THRESHOLDS.lost_search else causes:
+        rest, tried = without(causes, (c,)), list[tuple[float, Option]]()
+        for e in library.candidates if c.effect.site == "input" and not library.remembers(c) else ():
+            if e.site == c.site and library.remembers(e) and not any(library.related(e, k) for k in rest):
+                h, names, starts = library.hypothesis((*rest, e)), library.names(e), library.starts(e)
+                thetas = [h.theta(now.values | dict(zip(names, row, strict=True))) for row in starts.tolist()]
+                theta, _, left = promising(h, sets.windows, np.array(thetas), now.start)
+                tried.append((left, ((*rest, e), {n: float(theta[h.names.index(n)]) for n in names})))
+        out += [option for _, option in sorted(tried, key=lambda t: t[0])[:1]]
+    return out
 
 
 def merges(sets: FittedSets, found: Found) -> list[Option]:

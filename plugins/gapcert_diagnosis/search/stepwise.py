@@ -18,7 +18,7 @@ from gapcert_diagnosis.thresholds import THRESHOLDS
 from .candidates import Candidate, Causes, Library
 from .criterion import Found, Keys, agrees, beats, fails, keys, margin, noise, outdoes, rank, without
 from .fitted_sets import FittedSets, untold
-from .moves import additions, idle, merges, spared, swaps
+from .moves import additions, idle, merges, remembered, spared, swaps
 from .selection import drop, forward
 
 
@@ -246,7 +246,8 @@ class EquationSearch:
         def size(some: Causes) -> int:
             return sets.library.simplicity(some)[0]
 
-        for new, start in sorted([*swaps(sets, found), *merges(sets, found)], key=lambda o: size(o[0])):
+        options = [*swaps(sets, found), *merges(sets, found), *remembered(sets, found)]
+        for new, start in sorted(options, key=lambda o: size(o[0])):
             if not idle(sets, found, new):
                 fitted, more, merged = sets.fit(new, found, start), size(new) - size(causes), len(new) < len(causes)
                 least = margin([fitted, now], more, sets.cautious, merged=merged, spared=spared(sets, causes, new))
