@@ -451,18 +451,3 @@ def test_a_fit_that_stalls_goes_on_from_the_numbers_of_a_law_that_contains_its_o
     assert sets.better(right, again) < 0
     assert again.values["input_rate_limit_u"] == pytest.approx(3.0, rel=0.01)
     assert alternatives._plainer(sets, (two,), two, (one,), again) is again
-
-
-def test_what_is_smaller_than_all_first_values_of_a_law_is_promised_as_well():
-    """A sensor that is late by 0.08 of a sample, where the least that is tried is 0.4: 0.6 of that leaves more than none."""
-    t, rng, seconds = np.arange(T) * PERIOD, np.random.default_rng(3), 8e-4
-    u = multisine(T * PERIOD, PERIOD, 2.0, (0.2, 2.5), 4)
-    x = np.concatenate([[0.0], np.cumsum(PERIOD * u[:-1, 0])])
-    shown = np.interp(t - seconds, t, x) + 1e-4 * rng.standard_normal(T)
-    log = gc.Recording.of(t, {"x": shown, "y": x + 1e-4 * rng.standard_normal(T), "u": u[:, 0], "w": 0 * t}, hold="zero")
-    library, windows = prepared(equations(WAYS), log, [find("sensor-delay")])
-    sets = FittedSets(library, windows)
-    (late,) = (c for c in library.candidates if c.site == "x")
-    assert library.starts(late).min() * gains.THRESHOLDS.nonlinear_gain[0] > 2 * seconds
-    assert sets.promise(((), sets.nothing), late).gain > 100
-    assert sets.fit((late,), ((), sets.nothing)).values["sensor_delay_x"] == pytest.approx(seconds, rel=0.05)

@@ -273,13 +273,10 @@ class GainTable:
         return np.array([self.fit.hypothesis.value[k] + scale * np.sqrt(1 / self.precision[k] + left)])
 
     def _bounds(self, c: Candidate, values: Array) -> tuple[float, float]:
-        k, offs = self.library.amplitude(c), self.library.off(c)
+        k = self.library.amplitude(c)
         if k is None:
-            low, high = THRESHOLDS.nonlinear_gain
-            # Less than the least start of a single number does in proportion less.
-            least = len(offs) == 1 and abs(values[0] - offs[0]) <= np.abs(self.library.starts(c) - offs).min()
-            return 0.0 if least else low, high
-        off = offs[k]
+            return THRESHOLDS.nonlinear_gain
+        off = self.library.off(c)[k]
         low, high = (float((b[k] - off) / (values[k] - off)) for b in self.library.bounds(c))
         return min(low, high), max(low, high)
 
