@@ -384,8 +384,8 @@ class _Way:
     """
 
     measured: Dataset
-    piece: npt.NDArray[np.int64]
-    first: npt.NDArray[np.int64]
+    piece: Array
+    first: Array
 
     @cached_property
     def stops(self) -> dict[int, Array]:
@@ -397,7 +397,7 @@ class _Way:
         return sorted(self.stops, key=lambda p: -int(self.stops[p].max()))
 
     @cached_property
-    def place(self) -> tuple[list[int], Array]:
+    def place(self) -> tuple[list[int], npt.NDArray[np.intp]]:
         """Where windows begin, among the pieces and among the marks."""
         return [self.pieces.index(p) for p in self.piece.tolist()], np.searchsorted(self.marks, self.first)
 
