@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from exams import gears as toothed
 from exams import outputs as misfits
 from exams import plain as plants
 from exams import play, score, sit
@@ -179,6 +180,18 @@ def outputs(records: Sequence[Record]) -> list[Figure]:
     ]
 
 
+def gears(records: Sequence[Record]) -> list[Figure]:
+    played, still = ([r for r in records if bool(r["hidden"]) is some] for some in (True, False))
+    sizes = score.sizes(played)
+    return [
+        least(f"play first ({len(played)})", score.rate(played, score.in_class), 0.95),
+        most("a wrong name stated as certain", score.rate(played, score.certain_and_wrong), 0.01),
+        Figure("median error of the width", "share", score.median(sizes), goal=0.05),
+        most(f"false alarms, no play ({len(still)})", score.rate(still, lambda r: bool(score.named(r))), 0.005),
+        Figure("CPU time, median", "s", score.median([r["cpu"] for r in records])),
+    ]
+
+
 def _dirty(seed: int, index: int, limit: float) -> Record:
     """Even cases are clean, odd ones are the case before, soiled."""
     from exams.hidden.log import DIRT
@@ -204,6 +217,7 @@ PARTS = {
     "plain-unknown": Part(150, 4, lambda s, i, t: plants.unknown("plain-unknown", s, i, t), unknown),
     "outputs": Part(600, 11, lambda s, i, t: misfits.ask("outputs", s, i, t, True), outputs),
     "outputs-nothing": Part(120, 6, lambda s, i, t: misfits.ask("outputs-nothing", s, i, t, False), nothing),
+    "gears": Part(64, 4, lambda s, i, t: toothed.ask("gears", s, i, t), gears),
     "joints": Part(
         72, 2, lambda s, i, t: sit.sit(draw.single("joints", s, i, (("arm",), ("cartpole",), ("chain",))[i % 3]), t), joints
     ),

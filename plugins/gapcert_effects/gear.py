@@ -42,9 +42,11 @@ class _Gap(Law):
     }
 
     def grid(self, scales: Mapping[str, float]) -> list[tuple[float, ...]]:
-        shares = (0.1, 0.25, 0.5) if self.hides_motor else (0.35, 0.6, 0.8)
+        shares = (0.15, 0.4, 0.75) if self.hides_motor else (0.25, 0.5, 0.8)
         widths = [w * scales["position_range"] for w in spread(0.001, 0.3, 9)]
-        return [(w, w * h, 0.0) for w, h in itertools.product(widths, shares)]
+        # A link without friction of its own coasts, and one with much of it stops: on the times of the motion these differ.
+        rates = [0.0, *(r * scales["velocity"] / scales["position"] for r in (0.4, 1.2))]
+        return [(w, w * h, rate) for w, h, rate in itertools.product(widths, shares, rates)]
 
     def extension(self, site: str, model: gc.Model) -> Extension:
         own, law = self.named(site, model), rigid(site, model)
