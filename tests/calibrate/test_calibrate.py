@@ -73,7 +73,8 @@ def test_any_family_gets_a_claim_that_its_distribution_keeps(tmp_path: Path, nam
     r = ripple(z)
     share = float(((r < low) | (r > high)).mean())
     assert share <= 1e-2
-    assert share > 4e-3 or not made.exceedances  # 0 exceedances may give away much, 20 less
+    # 0 exceedances may give away much; 20 leave 20/n in the mean, and half of that in one question of hundreds.
+    assert share > 10 / len(made.z) or not made.exceedances
     boxes = Interval(np.maximum(z[:500] - 0.05, c.domain.low), np.minimum(z[:500] + 0.05, c.domain.high))
     over, (low, high) = c.gap.interval_over(boxes), c.gap.interval(z[:500])
     assert isinstance(c.gap, CalibratedGap)
