@@ -139,6 +139,8 @@ def _remains(gear: Gear, clean: Array, u: Array, sigma: float) -> float:
 def ask(part: str, seed: int, index: int, limit: float) -> dict[str, Any]:
     c = case(part, seed, index)
     g, key = c.gear, ["gear-play", "q"]
+    # The width itself a link may not show: what it is moved by is all that its angle tells.
+    moved = {("motor_shift", "link_shift")[g.side]: g.width * (g.share, 1 - g.share)[g.side], "width": g.width}
     asked = {
         "part": part,
         "seed": seed,
@@ -148,7 +150,7 @@ def ask(part: str, seed: int, index: int, limit: float) -> dict[str, Any]:
         "period": g.period,
         "hold": "zero",
         "noise": [float(f"{c.sigma:.3g}")],
-        "hidden": [{"effect": key[0], "site": key[1], "numbers": {"width": g.width}}] if g.width else [],
+        "hidden": [{"effect": key[0], "site": key[1], "numbers": moved}] if g.width else [],
         "label": "clear",
         "remains": round(c.remains, 3),
         "classes": [[key]] if g.width else [],

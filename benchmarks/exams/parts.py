@@ -186,7 +186,7 @@ def gears(records: Sequence[Record]) -> list[Figure]:
     return [
         least(f"play first ({len(played)})", score.rate(played, score.in_class), 0.95),
         most("a wrong name stated as certain", score.rate(played, score.certain_and_wrong), 0.01),
-        Figure("median error of the width", "share", score.median(sizes), goal=0.05),
+        Figure("median error of the shift", "share", score.median(sizes), goal=0.05),
         most(f"false alarms, no play ({len(still)})", score.rate(still, lambda r: bool(score.named(r))), 0.005),
         Figure("CPU time, median", "s", score.median([r["cpu"] for r in records])),
     ]
