@@ -118,7 +118,7 @@ def test_a_calibration_spends_what_an_audit_spends(tmp_path: Path) -> None:
 
 
 def test_an_audit_may_find_violations_but_not_more_than_the_claim_allows(tmp_path: Path) -> None:
-    c = calibrated(tmp_path, Perturbed(Drift(1), spike), request=Request("statistical", 1e-2, 1e-3, attack=50_000))
+    c = narrow(tmp_path, request=Request("statistical", 1e-2, 1e-3, attack=50_000))
     assert 0 < c.attack["violations"] <= c.attack["allowed"]
     assert _figures(c)["violations"] == c.summary()["audit"]["violations"] + c.attack["violations"]
     assert c.holds
@@ -149,10 +149,10 @@ def unlucky(c: gc.Certificate, request: Request) -> int:
     raise AssertionError("no seed is so unlucky")
 
 
-def narrow(tmp_path: Path) -> gc.Certificate:
+def narrow(tmp_path: Path, **options: Any) -> gc.Certificate:
     """The first of drawn calibrations that meets nothing of the spike: which one that is no fit can tell."""
     for seed in range(50):
-        c = calibrated(tmp_path / str(seed), Perturbed(Drift(1), spike), seed=seed, ledger=tmp_path / f"{seed}.json")
+        c = calibrated(tmp_path / str(seed), Perturbed(Drift(1), spike), seed=seed, ledger=tmp_path / f"{seed}.json", **options)
         assert c.calibration is not None
         if np.max(c.calibration.widening) < 1:
             return c

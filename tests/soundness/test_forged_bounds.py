@@ -66,7 +66,7 @@ MADE: dict[str, dict[str, Any]] = {
         "family": Multilinear(),
         "backend": Coarse(FIELD, 0.02),
         "sampling": gc.LatticeSampling(budget=200),
-        "lipschitz": Declared(VALUES, curvature=BENDS),
+        "lipschitz": Declared(MORE, curvature=BENDS),
     },
     "cells": {"family": Lifted(), "lipschitz": IntervalJacobian(2048, 8)},
 }
