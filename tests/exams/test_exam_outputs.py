@@ -31,3 +31,10 @@ def test_a_misfit_changes_its_output_alone_and_cannot_hide():
     calm = outputs.case("t", 1, 0, False)
     assert not calm.kind
     assert len(calm.recording().trajectories) == 1
+
+
+@pytest.mark.exam
+def test_an_answer_gives_way_to_a_tie_of_which_more_than_one_cause_differs():
+    said = outputs.ask("outputs", 6203, 147, 300.0, True)
+    assert "error" not in said
+    assert said["verdict"] == "unexplained"

@@ -53,11 +53,14 @@ class Answer:
 
     def with_answer(self, tie: Found) -> Answer:
         """With one of the ties as the answer, and the answer as one of the ties."""
-        (new,), (old,), rivals = without(tie[0], self.causes), without(self.causes, tie[0]), dict(self.rivals)
-        others = [(self.causes, self.fit), *(f for f in rivals.pop(old.key) if keys(f[0]) != keys(tie[0]))]
-        rivals[new.key] = tuple(rank(others, self.search.cautious))
+        come, gone = without(tie[0], self.causes), without(self.causes, tie[0])
+        left = [f for c in gone for f in self.rivals[c.key] if keys(f[0]) != keys(tie[0])]
+        others = tuple(rank([(self.causes, self.fit), *left], self.search.cautious))
+        rivals = {k: f for k, f in self.rivals.items() if k not in keys(gone)} | {c.key: others for c in come}
+        instead = {c.key: new for c, new in zip(gone, come, strict=False)}
+        stay = [instead.get(c.key, c) for c in self.causes if c not in gone or c.key in instead]
         ties = ((self.causes, self.fit), *(t for t in self.ties if t is not tie))
-        return replace(self, causes=tuple(new if c is old else c for c in self.causes), fit=tie[1], ties=ties, rivals=rivals)
+        return replace(self, causes=(*stay, *come[len(gone) :]), fit=tie[1], ties=ties, rivals=rivals)
 
     @property
     def nothing(self) -> Fit:
