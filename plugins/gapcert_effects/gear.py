@@ -45,7 +45,7 @@ class _Gap(Law):
         shares = (0.15, 0.4, 0.75) if self.hides_motor else (0.25, 0.5, 0.8)
         widths = [w * scales["position_range"] for w in spread(0.001, 0.3, 9)]
         # A link without friction of its own coasts, and one with much of it stops: on the times of the motion these differ.
-        rates = [0.0, *(r * scales["velocity"] / scales["position"] for r in (0.4, 1.2))]
+        rates = [0.0, *(r * scales["velocity"] / scales["position_range"] for r in (1.2, 3.6))]
         return [(w, w * h, rate) for w, h, rate in itertools.product(widths, shares, rates)]
 
     def extension(self, site: str, model: gc.Model) -> Extension:

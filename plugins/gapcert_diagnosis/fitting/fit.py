@@ -302,10 +302,10 @@ def _begun(h: Hypothesis, windows: Windows, here: Slopes, ends: _Ends) -> Hypoth
     fitted, least, span = best.copy(), square.copy(), np.concatenate(m.inputs)
     for i, (low, high) in enumerate(zip(span.min(axis=0).tolist(), span.max(axis=0).tolist(), strict=True)):
         tried = np.stack([np.where(np.arange(first.shape[1]) == i, v, fitted) for v in np.linspace(low, high, k)])
-        least_of, most_of = left(tried[0]), left(tried[-1])
-        if np.array_equal(least_of, most_of):
+        edges = left(tried[0]), left(tried[-1])
+        if np.array_equal(*edges):  # nothing remembers this input
             continue
-        over = np.stack([least_of, *(left(way) for way in tried[1:-1]), most_of])
+        over = np.stack([edges[0], *(left(way) for way in tried[1:-1]), edges[1]])
         at = np.clip(over.argmin(axis=0), 1, k - 2)
         a, b, c = (over[at + j, np.arange(len(at))] for j in (-1, 0, 1))
         vertex = 0.5 * (a - c) / np.where(a + c > 2 * b, a - 2 * b + c, np.inf)

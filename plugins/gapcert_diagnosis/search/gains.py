@@ -228,7 +228,7 @@ class GainTable:
         return found
 
     def loosened_pairs(self) -> list[Promise]:
-        """Each stated number without its prior, and the candidate that promises most beside it.
+        """Pairs of a stated number, freed of its tolerance, and the law that explains most together with it.
 
         What a law leaves may be held by that prior so firmly that neither the law nor the number helps without the other.
         """
