@@ -110,14 +110,22 @@ def test_only_the_daily_part_has_a_budget_and_a_slow_machine_does_not_break_it(t
     assert "the daily part took" in next(durations.problems(Durations(REFERENCE, over), Durations(REFERENCE, over)))
     for loop, factor in ((REFERENCE, 1), (2 * REFERENCE, 1.9)):
         (tmp_path / f"{factor}").write_text(Durations(loop, {("run", "a.py::test_a"): factor * (BUDGET - 1)}).text())
-        run = durations.merged([str(tmp_path / f"{factor}")])
+        run = durations.merged([str(tmp_path / f"{factor}")], KNOWN)
         assert list(durations.problems(run, run)) == []
+    # Most tests took longer by one factor: the machine; by more than machines differ, or in a few tests alone: ours.
+    known = Durations(REFERENCE, {("run", f"a.py::test_{k}"): (BUDGET - 1) / 9 for k in range(9)})
+    for slower, tests, fails in ((1.8, 9, False), (3.0, 9, True), (1.8, 3, True)):
+        rows = {row: seconds * (slower if k < tests else 1) for k, (row, seconds) in enumerate(known.rows.items())}
+        (tmp_path / "run").write_text(Durations(REFERENCE, rows).text())
+        assert bool(list(durations.problems(durations.merged([str(tmp_path / "run")], known), known))) is fails
 
 
 def test_a_test_that_one_run_skipped_costs_what_the_other_says(tmp_path):
     for name, seconds in (("bare", 0.0), ("rest", 4.0)):
         (tmp_path / name).write_text(Durations(REFERENCE, {("run", "a.py::test_a"): seconds}).text())
-    assert durations.merged([str(tmp_path / "bare"), str(tmp_path / "rest")]).rows == {("run", "a.py::test_a"): 4.0}
+    assert durations.merged([str(tmp_path / "bare"), str(tmp_path / "rest")], Durations(REFERENCE, {})).rows == {
+        ("run", "a.py::test_a"): 4.0
+    }
 
 
 def test_the_daily_part_is_within_its_budget():

@@ -8,7 +8,10 @@ record, `tests/durations.tsv`:
     python tests/support/durations.py accept FILE...    makes recorded runs the list
 
 Seconds are divided by those of a reference loop, timed by the same workers in the same run, and multiplied by what that loop
-took where the budget was set: so a slower or busier machine changes nothing. Parameters of a test count together.
+took where the budget was set; then by how much longer than in the list most tests took, since a loop of one kind does not tell
+what a slow machine does to all kinds of work. So a slower or busier machine changes nothing.
+
+Parameters of a test count together.
 """
 
 from __future__ import annotations
@@ -34,6 +37,10 @@ REFERENCE = 0.0105
 """CPU seconds of the reference loop on two noisy cores that both run tests: the machine of the budget."""
 BUDGET = 660.0
 """CPU seconds of the daily part on a fresh machine, where all is compiled: a sixth more than it took. Five minutes are 600."""
+TELLS = 0.2
+"""CPU seconds in the list from which a test tells how fast a machine is: what takes less may hang on what ran before it."""
+PACE = 2.0
+"""How much slower than the loop says a machine may be, at most (1.5 was seen): more is ours."""
 LONG = 10.0
 """CPU seconds from which a test starts before all others: less than that leaves no worker idle for long at the end."""
 ROWS_BETWEEN = 200
@@ -184,13 +191,15 @@ class _Recorder:
 # --- the program
 
 
-def merged(paths: Sequence[str]) -> Durations:
+def merged(paths: Sequence[str], known: Durations) -> Durations:
     """Several runs as one, as on the machine of the budget; what was skipped in one of them costs what another says."""
     rows: dict[tuple[str, str], float] = {}
     for path in paths:
         for row, seconds in Durations.of(Path(path).read_text()).scaled().rows.items():
             rows[row] = rows.get(row, 0.0) + seconds
-    return Durations(REFERENCE, rows)
+    ratios = [seconds / known.rows[row] for row, seconds in rows.items() if seconds and known.rows.get(row, 0.0) >= TELLS]
+    pace = min(max(median(ratios or [1.0]), 1 / PACE), PACE)
+    return Durations(REFERENCE, {row: seconds / pace for row, seconds in rows.items()})
 
 
 def problems(run: Durations, known: Durations) -> Iterator[str]:
@@ -207,14 +216,15 @@ def problems(run: Durations, known: Durations) -> Iterator[str]:
 
 def main(what: str, *paths: str) -> int:
     """The exit code."""
-    run = merged(paths)
+    known = Durations.of(LIST.read_text())
+    run = merged(paths, known)
     if what == "slowest":
         for (own, name), seconds in sorted(run.rows.items(), key=lambda one: -one[1]):
             print(f"{seconds:8.2f}  {own:8s}  {name}")
     elif what == "accept":
         LIST.write_text(run.text())
     else:
-        found = list(problems(run, Durations.of(LIST.read_text())))
+        found = list(problems(run, known))
         print(*found, ", ".join(f"{t} {s:.0f} s" for t, s in run.sums().items()) + " of CPU", sep="\n")
         return bool(found)
     return 0
