@@ -261,9 +261,10 @@ class Thresholds:
         "factors, and their inverses, of units that logs confuse",
     )
     near_slip: float = chosen(
-        0.03, "of such a factor: what a model's own numbers are worth; of two, 2.7 % apart, the nearer one"
+        0.05, "of such a factor, where the interval reaches it: none else is so far from 1; of two, 2.7 % apart, the nearer one"
     )
-    sure_slip: float = chosen(0.002, "the same, where the interval is narrower than what the model's own numbers are worth")
+    slip_halves: float = threshold(1.5, "half widths of an interval: three standard errors, which chance exceeds in 1 of 370")
+    sure_slip: float = chosen(0.005, "the same, where the interval is narrower than what the model's own numbers are worth")
     moved_edges: int = chosen(2, "times that an edge of what is tried moves out tenfold, where a number lies at it")
     at_bound: float = chosen(1e-6, "of the width of a number's bounds: what ends closer is told to be at one")
     swept_points: int = chosen(1000, "of a range, in which a law's size is looked for")

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 import gapcert as gc
 from gapcert_diagnosis import diagnose
@@ -41,6 +42,15 @@ CART = (
     0.0,
 )
 
+TANKS = (
+    {"states": {"low": "m", "high": "m"}, "inputs": {"q": "m^3/s"}, "period": "4 s", "outputs": {"seen": "low"}}
+    | {"parameters": {"A": {"value": "0.0515 m^2", "tolerance": "3 %"}, "a": {"value": "1.02e-3 m^2.5/s", "tolerance": "3 %"}}}
+    | {"derivative": {"low": "a*(sqrt(abs(high)) - sqrt(abs(low)))/A", "high": "(q - a*sqrt(abs(high)))/A"}},
+    lambda x, u: np.array([1e-3 * (np.sqrt(abs(x[1])) - np.sqrt(abs(x[0]))), u - 1e-3 * np.sqrt(abs(x[1]))]) / 0.05,
+    0.0,
+)
+"""One above the other; only the lower one has a gauge."""
+
 
 def commands(count, hold, seed, low=-1.0):
     """Levels that are held, and a wave on them."""
@@ -61,8 +71,8 @@ def lagged(u, seconds, h):
     return out
 
 
-def told(plant, u, way, shown=1.0, effects="all"):
-    """The diagnosis of a plant which the input u (T,) reaches by way(fine input, fine step)."""
+def told(plant, u, way, shown=1.0, effects="all", noise=(0, 0.004, 0.0)):
+    """The diagnosis of a plant which the input u (T,) reaches by way(fine input, fine step); noise: draw, share, colour."""
     section, slope, rest = plant
     model = equations({"kind": "equations", "integrator": "rk4", **section})
     h = model.period / FINE
@@ -73,7 +83,9 @@ def told(plant, u, way, shown=1.0, effects="all"):
         for level in levels:
             x = x + h * slope(x + h / 2 * slope(x, level), level)
     y = shown * np.array(path)
-    y = y + 0.004 * np.std(y) * np.random.default_rng(0).standard_normal(len(y))
+    draw, share, colour = noise
+    white = np.random.default_rng(draw).standard_normal(len(y))
+    y = y + share * np.std(y) * lfilter([np.sqrt(1 - colour**2)], [1, -colour], white)
     names = model.outputs[0].name, model.inputs[0].name
     recording = gc.Recording.of(np.arange(len(u)) * model.period, dict(zip(names, (y, u), strict=True)), hold="zero")
     return diagnose(model, recording, effects)
@@ -327,6 +339,16 @@ def test_a_thermometer_may_show_thousands_of_kelvin():
     """From there to 300 K no slope leads, and a heat that is not there would make up for some of it."""
     (cause,) = told(OVEN, 9 * commands(600, 50, 13, low=0.0), lambda u, h: u, 0.001).causes
     assert (cause.effect, cause.unit_slip) == ("sensor-scale", "1000")
+
+
+@pytest.mark.exam
+@pytest.mark.parametrize(("factor", "noise"), [(57.2958, (1, 0.02, 0.8)), (9.80665, (0, 0.004, 0.0)), (0.001, (0, 0.004, 0.0))])
+def test_a_gauge_may_show_another_unit_where_a_level_is_not_seen(factor, noise):
+    """The unseen level begins elsewhere, too, once the gauge is read rightly."""
+    (cause,) = told(TANKS, 1e-3 * (0.6 + 0.3 * commands(1200, 60, 14)), lambda u, h: u, factor, noise=noise).causes
+    assert cause.effect == "sensor-scale"
+    assert cause.unit_slip is not None
+    assert cause.parameters["scale"].value == pytest.approx(factor, rel=0.05)  # the level goes with the square of a
 
 
 @pytest.mark.exam

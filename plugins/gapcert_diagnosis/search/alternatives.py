@@ -277,7 +277,8 @@ def unit_slip(library: Library, c: Candidate, fitted: Fit) -> str | None:
     value, half = fitted.estimates()[library.names(c)[0]]
     slips = [(abs(abs(value) / slip - 1), slip, units) for units, f in THRESHOLDS.unit_slips for slip in (f, 1 / f)]
     off, slip, units = min(slips)
-    return units if off < THRESHOLDS.near_slip and off * slip < max(half, THRESHOLDS.sure_slip * slip) else None
+    near = max(THRESHOLDS.slip_halves * half, THRESHOLDS.sure_slip * slip)
+    return units if off < THRESHOLDS.near_slip and off * slip < near else None
 
 
 def flags(library: Library, c: Candidate, fitted: Fit) -> tuple[str, ...]:

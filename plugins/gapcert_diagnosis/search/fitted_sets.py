@@ -175,7 +175,7 @@ class FittedSets:
         """A set with a move more, fitted to the short windows from what is promised."""
         h, brief = self.library.hypothesis((*base[0], *s.move)), self.brief(base)
         theta = h.theta(brief.values | dict(s.values))
-        start = h.guessed(self.short, theta, brief.start)
+        start = h.guessed(self.short, theta, brief.start) if s.start is None else s.start
         return fit(h, self.short, theta=theta, start=start, iterations=iterations)
 
     def fit_further(self, first: Fit, iterations: int = THRESHOLDS.second_fit) -> Fit:

@@ -28,11 +28,15 @@ AT_ONCE = 200  # columns that are pushed along the path together, or little more
 @final
 @dataclass(frozen=True)
 class Promise:
-    """A move, first values of its numbers by name, and the fall of the squared residual, in units of χ, that they promise."""
+    """A move, first values of its numbers by name, and the fall of the squared residual, in units of χ, that they promise.
+
+    start: of the short windows (W, nx), where those of the set that is moved from are of no use.
+    """
 
     move: Causes
     values: Mapping[str, float]
     gain: float
+    start: Array | None = None
 
 
 @final

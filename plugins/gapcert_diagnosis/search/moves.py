@@ -158,15 +158,16 @@ def _unscreened(sets: FittedSets, base: Found, candidates: Sequence[Candidate]) 
 
 def slipped(sets: FittedSets, causes: Causes) -> list[Promise]:
     """Sensors in another unit, where nothing is followed: a start that is a thousandfold off shows a screen no scale."""
-    if causes or sets.nothing.chi.max() < THRESHOLDS.coarse_residual:
+    if causes or not sets.nothing.rough:
         return []
     out = []
     for c in (c for c in sets.library.candidates if c.effect.site == "output" and sets.library.is_factor(c)):
         h, (name,) = sets.library.hypothesis((c,)), sets.library.names(c)
         factors = [f for _, one in THRESHOLDS.unit_slips for f in (one, 1 / one)]
-        left = [float(followed(h, h.theta({name: f}), sets.short).chi.max()) for f in factors]
-        if min(left) < sets.brief(((), sets.nothing)).chi.max():
-            out.append(Promise((c,), {name: factors[int(np.argmin(left))]}, 0.0))
+        best, f = min(((followed(h, h.theta({name: f}), sets.short), f) for f in factors), key=lambda one: one[0].chi.max())
+        if best.chi.max() < sets.brief(((), sets.nothing)).chi.max():
+            # States that no channel shows begin elsewhere, too, where the others are read in another unit.
+            out.append(Promise((c,), {name: f}, 0.0, best.start))
     return out
 
 
