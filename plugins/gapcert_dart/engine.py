@@ -55,9 +55,10 @@ class DartEngine(Engine):
     def digest_data(self) -> list[object]:
         return [importlib.metadata.version("dartpy"), self.robot.digest()]
 
-    def links(self, coordinates: Mapping[str, str], period: float, values: Mapping[str, float]) -> list[Link] | None:
-        if self.config.touches:
-            return None
+    def beyond(self) -> tuple[str, ...]:
+        return (*super().beyond(), *(["shapes that may touch"] if self.config.touches else []))
+
+    def links(self, coordinates: Mapping[str, str], period: float, values: Mapping[str, float]) -> list[Link]:
         bodies = load(self.robot, fixed_base=self.config.fixed_base).getBodyNodes()
         return [_link(body, coordinates, self.stated) for body in bodies]
 

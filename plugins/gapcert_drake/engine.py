@@ -52,13 +52,20 @@ class DrakeEngine(Engine):
     def digest_data(self) -> list[object]:
         return [importlib.metadata.version("drake"), self.robot.digest()]
 
-    def links(self, coordinates: Mapping[str, str], period: float, values: Mapping[str, float]) -> list[Link] | None:
-        config = self.config
-        if config.touches or not config.discrete:
-            return None
-        loaded = load(self.robot, config, 1, 1e-3, config.gravity, None)
-        # One of the elements is gravity; others are springs.
-        return _links(loaded, coordinates, self.stated) if loaded.plant.num_force_elements() == 1 else None
+    def beyond(self) -> tuple[str, ...]:
+        found = {
+            "shapes that may touch": self.config.touches,
+            f"integrator {self.config.integrator}": not self.config.discrete,
+            # One of the elements is gravity.
+            "springs": self._load().plant.num_force_elements() > 1,
+        }
+        return (*super().beyond(), *(what for what, there in found.items() if there))
+
+    def links(self, coordinates: Mapping[str, str], period: float, values: Mapping[str, float]) -> list[Link]:
+        return _links(self._load(), coordinates, self.stated)
+
+    def _load(self) -> Loaded:
+        return load(self.robot, self.config, 1, 1e-3, self.config.gravity, None)
 
     def implicit(self) -> bool:
         return self.config.discrete

@@ -10,7 +10,8 @@ _HOME = homes(
     {
         "gapcert_engines.backend": "EngineBackend as_backend",
         "gapcert_engines.config": "Coefficient EngineConfig",
-        "gapcert_engines.contract": "ABSURD BodyInertia Drive Engine EngineWorld Joint JointType Motor Thruster",
+        "gapcert_engines.contract": "ABSURD BodyInertia Drive Engine EngineWorld Joint JointType Motor Thruster "
+        "ball_columns body_columns",
         "gapcert_engines.equations_model": "PHYSICAL EngineModel",
         "gapcert_engines.native_model": "Group NativeModel",
         "gapcert_engines.robot.description": "RobotDescription chosen_model read_robot",

@@ -11,6 +11,8 @@ from gapcert_engines.contract import Joint as Joint
 from gapcert_engines.contract import JointType as JointType
 from gapcert_engines.contract import Motor as Motor
 from gapcert_engines.contract import Thruster as Thruster
+from gapcert_engines.contract import ball_columns as ball_columns
+from gapcert_engines.contract import body_columns as body_columns
 from gapcert_engines.equations_model import PHYSICAL as PHYSICAL
 from gapcert_engines.equations_model import EngineModel as EngineModel
 from gapcert_engines.native_model import Group as Group

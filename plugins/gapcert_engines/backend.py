@@ -35,7 +35,7 @@ class EngineBackend(Backend):
         self._worlds: dict[int, EngineWorld] = {}
         self.period, self.substeps = step_period(engine.config.period, model), engine.config.substeps
         self._joints = [j for j in engine.joints if j.movable]
-        if not self._joints and not engine.base:
+        if not self._joints and not engine.loose:
             raise UsageError(
                 f"robot: {engine.file} has no movable joint; expected one that turns or slides, or a base that floats"
             )
@@ -145,13 +145,13 @@ class EngineBackend(Backend):
         return Step(numbers[:, w.seen], numbers[:, w.unseen] if w.hidden else None)
 
     def _robot(self, x: Array, hidden: Array | float) -> tuple[Array, Array | None]:
-        """Joints (n, nj, 2) and base (n, 13)."""
+        """Joints (n, nj, 2) and what is loose (n, ·)."""
         w, n, nj, full = self._wiring, len(x), len(self._joints), x
         if not w.straight:
             full = np.empty((n, len(w.seen) + len(w.unseen)))
             full[:, w.seen] = x
             full[:, w.unseen] = hidden
-        base = from_columns(full[:, 2 * nj :], self.config) if self.engine.base else None
+        base = from_columns(full[:, 2 * nj :], self.config) if self.engine.loose else None
         return full[:, : 2 * nj].reshape(n, nj, 2), base
 
     def _levered(self, u: Array, parameters: dict[str, Array]) -> Array:
@@ -243,7 +243,7 @@ class EngineBackend(Backend):
         copies = min(self.config.tiles, most)
         if copies < 2:
             return 1, "untiled: one copy was asked for" if self.config.tiles < 2 else reason
-        if self.engine.base or self._wiring.drive is not None:
+        if self.engine.loose or self._wiring.drive is not None:
             return 1, "untiled: copies share a fixed base without a drive"
         if self._same_bits(copies):
             return copies, f"{copies} copies, bit-equal to one robot"

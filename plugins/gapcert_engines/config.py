@@ -40,7 +40,8 @@ class EngineConfig(BaseModel, ABC):
     """`states` maps a state to `JOINT.position`, `JOINT.velocity` or, for a base that floats, `base.FIELD`; `inputs` maps an
     input to the joint that its effort drives, to `MOTOR.ctrl` where the file has such a motor, or to `drive`.
 
-    Fields of the base: x, y, z, vx, vy, vz, wx, wy, wz in the world's frame, and with `rotation: euler` roll, pitch and yaw
+    Fields of the base, and of another body that is free, BODY.FIELD: x, y, z, vx, vy, vz, wx, wy, wz in the world's frame, and
+    of the base with `rotation: euler` roll, pitch and yaw
     (turned in this order about the fixed axes; singular at a pitch of ±90°). `period` (default: the model's) is divided into
     `substeps` engine steps with one effort. `gravity` and `joint_damping` replace the file's (or the engine's default).
     `ground` is the friction coefficient of a plane z = 0 that is added. `tiles` copies are stepped at once where that gives the
@@ -96,8 +97,7 @@ class EngineConfig(BaseModel, ABC):
     @classmethod
     def _fields(cls, states: dict[str, str]) -> dict[str, str]:
         for name, target in states.items():
-            owner, _, field = target.rpartition(".")
-            if not owner or (owner != "base" and field not in ("position", "velocity")):
+            if not target.rpartition(".")[0]:
                 raise ValueError(f"state '{name}' is '{target}'; expected JOINT.position, JOINT.velocity or base.FIELD")
         return _distinct(states)
 

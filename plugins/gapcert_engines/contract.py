@@ -24,6 +24,17 @@ BASE = (*_PLACE, StateSpec("base.rotation", "1", "quaternion"), *_MOTION)
 BASE_EULER = (*_PLACE, *(StateSpec(f"base.{a}", "rad", "angle") for a in ("roll", "pitch", "yaw")), *_MOTION)
 """The same with rotation = turns about the fixed axes x, y, z in this order."""
 
+
+def body_columns(name: str) -> tuple[StateSpec, ...]:
+    """Of a free body, as of a base that floats."""
+    return tuple(StateSpec(f"{name}.{s.name.removeprefix('base.')}", s.unit, s.kind) for s in BASE)
+
+
+def ball_columns(name: str) -> tuple[StateSpec, ...]:
+    """Of a ball joint: rotation (w, x, y, z), and rate in the frame of what it carries."""
+    return StateSpec(f"{name}.rotation", "1", "quaternion"), *(StateSpec(f"{name}.w{a}", "rad/s") for a in "xyz")
+
+
 ENDLESS = (-float("inf"), float("inf"))
 ABSURD = 1e100
 """No position or velocity of a robot, in any unit; its square is still finite."""
@@ -184,8 +195,8 @@ class EngineWorld(ABC):
         """One period: (joints, base) afterwards, as new arrays.
 
         joints (n, nj, 2): position and velocity of the movable joints, n a multiple of `copies`; effort (n, 1, nj + nt), held,
-        or (n, substeps, nj + nt): at the joints, and the controls of nt thrusters; base (n, 13) as BASE orders it, where it
-        floats; command (n, m): mixing · inputs of the drive.
+        or (n, substeps, nj + nt): at the joints, and the controls of nt thrusters; base (n, ·): 13 numbers as BASE orders them,
+        where it floats, then those of `Engine.beside`; command (n, m): mixing · inputs of the drive.
         The answer for a row must not depend on earlier rows: every query starts from a state that is set in full.
         """
 
@@ -197,17 +208,21 @@ class EngineWorld(ABC):
 class Engine(ABC):
     """A robot in a physics engine, described by plain data (it is pickled), and the worlds that step it.
 
-    joints: all of them, in the engine's order; base: 13 default numbers where it floats, else empty; parameters: what
+    joints: all of them, in the engine's order; base: 13 default numbers where it floats, else empty; beside: what moves
+    besides, free bodies and ball joints, and its default numbers; parameters: what
     `EngineWorld.set` takes, with the stated values; motors: at most one per joint; thrusters: those that inputs name; rowwise:
     its worlds take native parameters row by row as well, `EngineWorld.set_rows`, so that queries which differ in them share a
     batch; unsolved: the change of a state per second that a solver of constraints may leave undone; integrator: of its
-    equations, see `as_section`; friction_after: their dry friction does not feel damping that is solved with the step.
+    equations, see `as_section`; friction_after: their dry friction does not feel damping that is solved with the step;
+    springs_held: where damping is solved with the step, so are springs.
     """
 
     config: EngineConfig
     file: str
     joints: tuple[Joint, ...]
     base: tuple[float, ...] = ()
+    beside: tuple[StateSpec, ...] = ()
+    beside_default: tuple[float, ...] = ()
     parameters: tuple[Parameter, ...] = ()
     motors: tuple[Motor, ...] = ()
     thrusters: tuple[Thruster, ...] = ()
@@ -215,6 +230,7 @@ class Engine(ABC):
     unsolved: float = 0.0
     integrator: str = "semi_implicit"
     friction_after: bool = False
+    springs_held: bool = True
 
     @abstractmethod
     def open(self, copies: int, period: float, drive: Drive | None) -> EngineWorld:
@@ -223,6 +239,11 @@ class Engine(ABC):
     @abstractmethod
     def digest_data(self) -> list[object]:
         """JSON-able: the engine's version and everything in the files that determines the answers (the config is added)."""
+
+    @property
+    def loose(self) -> tuple[float, ...]:
+        """Default numbers of all that is no joint of one number: the base, and what moves besides."""
+        return (*self.base, *self.beside_default)
 
     @property
     def stated(self) -> dict[str, float]:
@@ -260,26 +281,32 @@ class Engine(ABC):
         """Of a step: by how much the engine may miss its own equations under these native parameters, where it iterates."""
         return 1e-9
 
+    def beyond(self) -> tuple[str, ...]:
+        """What acts besides bodies on hinges and slides, each as a phrase; where nothing does, `section` is exact."""
+        found = {
+            "a base that floats": self.base,
+            "free bodies or ball joints": self.beside,
+            "a drive of its own": self.config.drive,
+        }
+        return tuple(what for what, there in found.items() if there)
+
     def section(
         self, coordinates: Sequence[str], period: float, free: Mapping[str, str], values: Mapping[str, float]
-    ) -> dict[str, Any] | None:
+    ) -> dict[str, Any]:
         """The robot as part of an equations model's section: parameters, bodies, gravity, forces without inputs, integrator.
 
-        None where more than a tree of bodies acts. coordinates: of the movable joints; free: native parameters → names of
-        parameters that stand for their numbers; values: those of native parameters that are not the file's.
+        It stands for a robot of which nothing goes `beyond` it. coordinates: of the movable joints; free: native parameters →
+        names of parameters that stand for their numbers; values: those of native parameters that are not the file's.
         """
-        if self.base or self.config.drive:
-            return None
         named = dict(zip((j.name for j in self.joints if j.movable), coordinates, strict=True))
-        if (links := self.links(named, period, values)) is None:
-            return None
+        links = self.links(named, period, values)
         x, y, z = (self.stated[f"gravity_{a}"] for a in "xyz")
-        how: dict[str, Any] = {"after": self.friction_after, "integrator": self.integrator}
+        how: dict[str, Any] = {"after": self.friction_after, "integrator": self.integrator, "springs": self.springs_held}
         return as_section(links, (x, y, z), free, implicit=self.implicit(), **how)
 
-    def links(self, coordinates: Mapping[str, str], period: float, values: Mapping[str, float]) -> list[Link] | None:
-        """What `section` writes, None where it writes nothing; coordinates: joint → coordinate."""
-        return None
+    @abstractmethod
+    def links(self, coordinates: Mapping[str, str], period: float, values: Mapping[str, float]) -> list[Link]:
+        """What `section` writes; coordinates: joint → coordinate."""
 
     def implicit(self) -> bool:
         """Is the damping of joints solved with the step, (M + h D) a = forces − D v?"""
@@ -295,7 +322,7 @@ class Engine(ABC):
     def scene(self, position: Array, base: Array | None) -> Scene | None:
         """The robot's shapes, and its links by the engine's own kinematics; None where it says nothing of them.
 
-        position (n, nj) of the movable joints, base (n, 13) as BASE orders it, where it floats.
+        position (n, nj) of the movable joints, base (n, ·) as of a world, where anything is loose.
         """
         return None
 

@@ -91,17 +91,17 @@ class EngineModel(Model):
 
     @classmethod
     def from_config(cls, config: EngineModelConfig, context: Context) -> EngineModel | NativeModel:
-        """The engine's section is that of a backend. One in contact has no equations, and is rolled out itself."""
+        """The engine's section is that of a backend. A robot that is more than bodies on joints is rolled out itself."""
         of = config.of
         if context.period is not None and getattr(of, "period", "") is None:
             of = of.model_copy(update={"period": f"{context.period:.9g} s"})
         if isinstance(of, EngineConfig) and in_contact(of):
-            rolled = NativeModel(of, context)
-            known = _toleranced(config.parameters, {p.name: p for p in rolled.backend.parameters})
-            return NativeModel(of, context, known) if known else rolled
+            return _rolled(config, of, context)
         backend: EngineBackend = registry().build("backend", of.kind, of, replace(context, model=None))
         if not isinstance(backend, EngineBackend):
             raise UsageError(f"model.of: '{config.of.kind}' is no physics engine on its own; expected an engine's section")
+        if backend.engine.beyond():
+            return _rolled(config, of, context)
         stated = {p.name: p for p in backend.parameters}
         return cls(backend, _toleranced(config.parameters, stated))
 
@@ -254,6 +254,12 @@ class EngineModel(Model):
         ]
 
 
+def _rolled(config: EngineModelConfig, of: EngineConfig, context: Context) -> NativeModel:
+    model = NativeModel(of, context)
+    known = _toleranced(config.parameters, {p.name: p for p in model.backend.parameters})
+    return NativeModel(of, context, known) if known else model
+
+
 def _native_parameters(backend: EngineBackend) -> dict[str, Parameter]:
     """The engine's native parameters, and inertia of joints that it has none of: only the equations know that."""
     out = {p.name: p for p in backend.parameters}
@@ -353,9 +359,11 @@ def _written(
     if lost := [q for q in names if f"{q}_dot" not in units]:
         raise UsageError(f"model.of.states: the velocity of '{lost[0]}' has another name; call it {lost[0]}_dot")
     there = {p.name for p in backend.parameters}
+    if more := backend.engine.beyond():
+        raise UsageError(
+            f"model.of: {backend.engine.file} is more than a tree of bodies on hinges and slides: {', '.join(more)}"
+        )
     robot = backend.engine.section(names, backend.period, free, {p.name: p.value for p in parameters if p.name in there})
-    if robot is None:
-        raise UsageError(f"model.of: {backend.engine.file} is more than a tree of bodies on hinges and slides")
     driven = {backend.driven(u.name): _effort(backend, u.name, free) for u in backend.inputs}
     forces = {q: " ".join(t for t in (driven.get(q, ""), robot["forces"].get(q, "")) if t) for q in names}
     section = {

@@ -188,7 +188,8 @@ class NativeModel(Model):
         )
 
     def _without(self, what: str, *asked: object) -> NoReturn:
-        raise UsageError(f"model.of: {self.backend.engine.file} in contact is known by its steps alone, without {what}; "
+        more = ", ".join(self.backend.engine.beyond())
+        raise UsageError(f"model.of: {self.backend.engine.file} ({more}) is known by its steps alone, without {what}; "
                          f"use it as a backend, or in a diagnosis")  # fmt: skip
 
     extend: Any = partialmethod(_without, "equations to extend")
@@ -204,7 +205,7 @@ def in_contact(of: EngineConfig) -> bool:
 
 def _backend(of: EngineConfig, context: Context) -> EngineBackend:
     """The engine, with states that it knows; what none of them says is hidden state there."""
-    own = {n: t for n, t in of.states.items() if t != ROTATION and t not in _BODY}
+    own = {n: t for n, t in of.states.items() if not t.endswith(".rotation") and t not in _BODY}
     if not own:
         raise UsageError("model.of.states: there is no position in it; expected all numbers of the robot, such as x: base.x")
     kind = getattr(of, "kind", "")

@@ -89,7 +89,7 @@ def wire(engine: Engine, model: System | None) -> Wiring:
     starts = np.cumsum([0, *(c.size for c in columns.values())])
     unseen = [k for k in range(len(names)) if k not in seen]
     rest = np.array([(j.rest, 0.0) for j in movable]).ravel()
-    default = np.concatenate([rest, to_columns(np.asarray(engine.base)[None], config)[0]])
+    default = np.concatenate([rest, to_columns(np.asarray(engine.loose)[None], config)[0]])
     spread = [c for k in unseen for c in range(starts[k], starts[k + 1])]
     pushed = [*movable, *engine.thrusters]
     position = {target.rpartition(".")[0]: name for name, target in config.states.items() if target.endswith(".position")}
@@ -112,13 +112,20 @@ def _columns(engine: Engine, movable: Sequence[Joint]) -> dict[str, StateSpec]:
     specs = [_axis(f"{j.name}.{FIELDS[k]}", j, k) for j in movable for k in (0, 1)]
     if engine.base:
         specs += BASE_EULER if engine.config.rotation == "euler" else BASE
+    specs += engine.beside
     return {s.name: s for s in specs}
 
 
 def _column(name: str, target: str, engine: Engine, columns: Mapping[str, StateSpec]) -> str:
     owner, _, _ = target.rpartition(".")
-    if owner != "base":
+    if owner in {s.name.rpartition(".")[0] for s in engine.beside}:
+        known = [c for c in columns if c.startswith(f"{owner}.") and columns[c].kind != "quaternion"]
+        if target not in known:
+            raise UsageError(f"backend.states.{name}: found '{target}'; expected one of {', '.join(known)}")
+    elif owner != "base":
         _find(f"states.{name}", owner, engine)
+        if target not in columns:
+            raise UsageError(f"backend.states.{name}: found '{target}'; expected {owner}.position or {owner}.velocity")
     elif not engine.base:
         raise UsageError(f"backend.states.{name}: the base is fixed, and '{target}' is its own; set fixed_base: false")
     elif target not in columns or columns[target].kind == "quaternion":
@@ -259,8 +266,8 @@ def step_period(period: str | None, model: System | None) -> float:
 
 
 def to_columns(base: Array, config: EngineConfig) -> Array:
-    """The base's 13 numbers (n, 13) as the spec's columns: themselves, or 12 with roll, pitch and yaw."""
-    if config.rotation == "quaternion" or not base.shape[1]:
+    """The base's 13 numbers as the spec's columns: themselves, or 12 with roll, pitch and yaw; what follows stays."""
+    if config.rotation == "quaternion" or config.fixed_base:
         return base
     w, x, y, z = base[:, 3], base[:, 4], base[:, 5], base[:, 6]
     ahead, aside = 1 - 2 * (y * y + z * z), 2 * (w * z + x * y)
@@ -272,8 +279,8 @@ def to_columns(base: Array, config: EngineConfig) -> Array:
 
 
 def from_columns(columns: Array, config: EngineConfig) -> Array:
-    """Inverse of `to_columns`: (n, 12 or 13) → (n, 13)."""
-    if config.rotation == "quaternion" or not columns.shape[1]:
+    """Inverse of `to_columns`."""
+    if config.rotation == "quaternion" or config.fixed_base:
         return columns
     (cr, cp, cy), (sr, sp, sy) = np.cos(columns[:, 3:6].T / 2), np.sin(columns[:, 3:6].T / 2)
     rotation = np.stack(

@@ -96,8 +96,9 @@ class BodyConfig(_Section):
 
     Its frame is the joint's: at the place `at` in the frame of the body `on` (by default the world), turned by the quaternion
     `turned` (w, x, y, z). In that frame stand `axis`, `mass`, centre of mass `com`, and `inertia` about it (xx, yy, zz, and
-    where they are not zero xy, xz, yz); `armature` is inertia that the joint alone feels; `drag` slows the body in the
-    world, in proportion to its mass and inertia. Numbers in SI units, or expressions of parameters.
+    where they are not zero xy, xz, yz); `armature` is inertia that the joint alone feels; `lifted` is the share of its weight
+    that something else carries; `drag` slows the body in the world, in proportion to its mass and inertia. Numbers in SI units,
+    or expressions of parameters.
     """
 
     joint: str | None = Field(None, description="the coordinate that moves it; default: welded")
@@ -118,6 +119,7 @@ class BodyConfig(_Section):
         description="about the centre of mass, xx, yy, zz (and xy, xz, yz), in kg·m²",
     )
     armature: Expression = Field("0", description="inertia that the joint alone feels, in kg·m² or kg")
+    lifted: Expression = Field("0", description="share of its weight that something else carries")
     drag: DragConfig = Field(DragConfig(), description="what slows the body in the world")
 
     @model_validator(mode="after")

@@ -66,8 +66,14 @@ class GazeboEngine(Engine):
     def digest_data(self) -> list[object]:
         return [*self._versions, hashlib.sha256(self._text.encode()).hexdigest()]
 
-    def links(self, coordinates: Mapping[str, str], period: float, values: Mapping[str, float]) -> list[Link] | None:
-        return None if self._found.touches else self._found.links(coordinates, self.stated)
+    def beyond(self) -> tuple[str, ...]:
+        found = {"shapes that may touch": self._found.touches, "links in a loop": self._found.links({}, self.stated) is None}
+        return (*super().beyond(), *(what for what, there in found.items() if there))
+
+    def links(self, coordinates: Mapping[str, str], period: float, values: Mapping[str, float]) -> list[Link]:
+        links = self._found.links(coordinates, self.stated)
+        assert links is not None, "nothing goes beyond its bodies"
+        return links
 
     def implicit(self) -> bool:
         return True

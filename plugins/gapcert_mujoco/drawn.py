@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 from gapcert import Array
 from gapcert.plugin import Scene, Shape
 
-from .robot import floating, scalar
+from .robot import Loose, scalar
 
 SEEN = 3
 """Geoms of groups below this are seen, as in MuJoCo's own viewer; the others collide."""
@@ -20,8 +21,8 @@ _ROOM = 2.0
 """Half size of a plane without end, in sizes of the robot."""
 
 
-def scene(model: Any, position: Array, base: Array | None) -> Scene:
-    """See Engine.scene; links are the bodies that have a shape."""
+def scene(model: Any, position: Array, base: Array | None, moving: Sequence[Loose]) -> Scene:
+    """See Engine.scene; links are the bodies that have a shape. moving: what the columns of the base are of."""
     shapes = _shapes(model)
     bodies = sorted({s.link for s in shapes})
     data, places = mujoco.MjData(model), model.jnt_qposadr[scalar(model)]
@@ -29,8 +30,11 @@ def scene(model: Any, position: Array, base: Array | None) -> Scene:
     for k, row in enumerate(position):
         data.qpos[places] = row
         if base is not None:
-            start = floating(model)[0]
-            data.qpos[start : start + 7] = base[k, :7]
+            at = 0
+            for one in moving:
+                shown = 4 if one.ball else 7
+                data.qpos[one.q : one.q + shown] = base[k, at : at + shown]
+                at += sum(s.size for s in one.columns)
         mujoco.mj_kinematics(model, data)
         poses[k, :, :3], poses[k, :, 3:] = data.xpos[bodies], data.xquat[bodies]
     names = tuple(model.body(b).name or f"body{b}" for b in bodies)

@@ -21,15 +21,16 @@ from .drawn import scene
 from .parameters import Natives
 from .patch import patched, wrapper
 from .robot import (
+    SCHEMES,
+    beyond,
     binary,
     compiled,
     joint_name,
     left_over,
+    loose,
     motors,
     restored,
-    scalar,
     thrusters,
-    touches,
     unconstrained,
 )
 from .world import MuJoCoWorld
@@ -40,11 +41,6 @@ _KINDS = {
     mujoco.mjtJoint.mjJNT_SLIDE: "prismatic",
     mujoco.mjtJoint.mjJNT_BALL: "ball",
     mujoco.mjtJoint.mjJNT_FREE: "free",
-}
-_INTEGRATORS = {
-    mujoco.mjtIntegrator.mjINT_EULER: "semi_implicit",
-    mujoco.mjtIntegrator.mjINT_IMPLICITFAST: "semi_implicit",
-    mujoco.mjtIntegrator.mjINT_RK4: "rk4",
 }
 _ITERATED = 1e-4  # relative: what MuJoCo's solver leaves at its default tolerance; chosen, not measured
 _COORDINATES_AT_MOST = 2048
@@ -69,19 +65,22 @@ class MuJoCoEngine(Engine):
         self._check(model, kinds)
         self.rowwise = config.implementation == "mjx"
         self.joints = tuple(_joint(model, k, kind) for k, kind in enumerate(kinds) if kind != "free")
-        if "free" in kinds:
-            start = int(model.jnt_qposadr[kinds.index("free")])
-            self.base = (*model.qpos0[start : start + 7].tolist(), *[0.0] * 6)
+        self._loose = loose(model, fixed_base=config.fixed_base)
+        poses = [one.rest(model) for one in self._loose]
+        floats = not config.fixed_base
+        self.base, self.beside_default = poses[0] if floats else (), tuple(v for pose in poses[floats:] for v in pose)
+        self.beside = tuple(s for one in self._loose[floats:] for s in one.columns)
         self.motors = motors(self._path)
         self.thrusters = () if config.drive else thrusters(model)
         natives = Natives(model)
         self.parameters = tuple(natives.parameters)
         self._unconstrained, self._implicit = unconstrained(model), _implicit(model)
-        self.integrator = _INTEGRATORS.get(model.opt.integrator, "")
+        self.integrator = SCHEMES.get(model.opt.integrator, "")
         # Newton's too: it stops as the others do, also where a constraint has just begun or ceased to act.
         self.unsolved = 0.0 if self._unconstrained else left_over(model)
         self._belts = tuple(model.geom(int(k)).name for k in np.flatnonzero(model.geom_surfacevel.any(axis=1)))
 
+    springs_held = False
     from_config = classmethod(as_backend)
 
     def open(self, copies: int, period: float, drive: Drive | None) -> EngineWorld:
@@ -100,11 +99,14 @@ class MuJoCoEngine(Engine):
         ]
         return [*data, self.config.tiles, *versions()] if self.rowwise else data
 
-    def links(self, coordinates: Mapping[str, str], period: float, values: Mapping[str, float]) -> list[Link] | None:
+    def beyond(self) -> tuple[str, ...]:
+        return (*super().beyond(), *beyond(self._model()))
+
+    def links(self, coordinates: Mapping[str, str], period: float, values: Mapping[str, float]) -> list[Link]:
         model, every = self._model(), self.stated | dict(values)
         model = Natives(model).varied(model, every)
         model.opt.timestep = period / self.config.substeps
-        return _links(model, coordinates, every) if _plain(model) and not self.thrusters else None
+        return _links(model, coordinates, every)
 
     def accuracy(self, values: Mapping[str, float]) -> float:
         """Dry friction is solved until an iteration gains less than the option `tolerance`."""
@@ -120,7 +122,7 @@ class MuJoCoEngine(Engine):
         return {name: text} | ({"extended.py": wrapper(name, unsaid)} if unsaid else {})
 
     def scene(self, position: Array, base: Array | None) -> Scene:
-        return scene(self._model(), position, base)
+        return scene(self._model(), position, base, self._loose)
 
     def tiles(self) -> tuple[int, str]:
         if self.rowwise:
@@ -144,11 +146,6 @@ class MuJoCoEngine(Engine):
 
     def _check(self, model: Any, kinds: list[str]) -> None:
         where = f"backend.robot: {self.file}"
-        if "ball" in kinds:
-            name = joint_name(model, kinds.index("ball"))
-            raise UsageError(f"{where}: joint '{name}' is a ball; expected hinges and slides; write it as a chain of hinges")
-        if kinds.count("free") > 1:
-            raise UsageError(f"{where} has {kinds.count('free')} free joints; expected at most one, the base")
         drive = self.config.drive
         if drive and any(kind == mujoco.mjtTrn.mjTRN_SITE for kind in model.actuator_trntype):
             raise UsageError(f"{where}: inputs go to motors at sites and to a drive; expected one of the two")
@@ -223,15 +220,9 @@ def _moved(model: Any, j: int, coordinate: str, name: str, on: str | None, at: A
         damping=float(model.dof_damping[dof]),
         dry=float(model.dof_frictionloss[dof]),
         soft=_softness(model, int(dof)),
+        stiffness=float(model.jnt_stiffness[j]),
+        rest=float(model.qpos_spring[model.jnt_qposadr[j]]),
     )
-
-
-def _plain(model: Any) -> bool:
-    """Hinges and slides, without springs, contacts or anything else that acts; ends of joints act where they are reached."""
-    more = (model.jnt_stiffness, model.body_gravcomp, model.dof_dampingpoly)
-    acts = any(np.any(part) for part in more) or model.ntendon or model.neq or model.nflex
-    medium = model.opt.density or model.opt.viscosity or np.any(model.opt.wind)
-    return bool(scalar(model).all() and not acts and not medium and not touches(model) and model.opt.integrator in _INTEGRATORS)
 
 
 def _inertia(model: Any, k: int, anchor: Any) -> dict[str, Any]:
@@ -244,6 +235,7 @@ def _inertia(model: Any, k: int, anchor: Any) -> dict[str, Any]:
         "com": tuple((model.body_ipos[k] - anchor).tolist()),
         "inertia": moments(full),
         "origin": tuple((-anchor).tolist()),
+        "lifted": float(model.body_gravcomp[k]),
     }
 
 

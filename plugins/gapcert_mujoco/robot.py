@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, final
 
 import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from gapcert import UsageError
-from gapcert_engines import Motor, Thruster
+from gapcert import StateSpec, UsageError
+from gapcert_engines import Motor, Thruster, ball_columns, body_columns
 
 if TYPE_CHECKING:
     from .config import MuJoCoConfig
@@ -21,6 +22,12 @@ _SCALAR = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 _JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _PLAIN = (mujoco.mjtTrn.mjTRN_SITE, mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE)
 _DISABLE = mujoco.mjtDisableBit
+SCHEMES = {
+    mujoco.mjtIntegrator.mjINT_EULER: "semi_implicit",
+    mujoco.mjtIntegrator.mjINT_IMPLICITFAST: "semi_implicit",
+    mujoco.mjtIntegrator.mjINT_RK4: "rk4",
+}
+"""Integrators that equations have, too."""
 _ALL = 2**31 - 1
 """The bit mask of a geom that meets all others."""
 _SMALLEST = 1e-15
@@ -53,17 +60,32 @@ def compiled(path: Path, config: MuJoCoConfig, copies: int = 1) -> Any:
 
 def _compiled(path: Path, config: MuJoCoConfig, copies: int, smallest: float) -> Any:
     """With principal moments of inertia raised to `smallest`, unless the file sets a bound of its own."""
-    specs = [_spec(path, config) for _ in range(copies)]
-    for spec in specs:
-        spec.compiler.boundinertia = spec.compiler.boundinertia or smallest
-    for k, copy in enumerate(specs[1:], 1):
-        specs[0].attach(copy, suffix=f"#{k}", frame=specs[0].worldbody.add_frame())
-    return specs[0].compile()
+    spec = _spec(path, config)
+    spec.compiler.boundinertia = spec.compiler.boundinertia or smallest
+    if copies > 1:
+        _bare(spec)
+        more = [spec.copy() for _ in range(copies - 1)]
+        for k, copy in enumerate(more, 1):
+            spec.attach(copy, suffix=f"#{k}", frame=spec.worldbody.add_frame())
+    return spec.compile()
+
+
+def _bare(spec: Any) -> None:
+    """Takes out shapes, once bodies have the inertia that these give them: copies share a model where nothing touches."""
+    model = spec.compile()
+    for body in list(spec.bodies)[1:]:
+        body.mass, body.ipos, body.iquat = model.body_mass[body.id], model.body_ipos[body.id], model.body_iquat[body.id]
+        body.inertia, body.fullinertia, body.explicitinertial = model.body_inertia[body.id], [np.nan, *[0.0] * 5], True
+    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+    spec.compiler.settotalmass, spec.compiler.balanceinertia = -1, False
+    for elements in (spec.pairs, spec.excludes, [g for g in spec.geoms if not g.fluid_ellipsoid], spec.meshes, spec.hfields):
+        for element in list(elements):
+            spec.delete(element)
 
 
 def _spec(path: Path, config: MuJoCoConfig) -> Any:
-    """The file with the spec's options, without what cannot move it: sensors, cameras, lights; and without its actuators but
-    those at sites that inputs name."""
+    """The file with the spec's options, without what cannot move it: sensors, cameras, lights, pictures; and without its
+    actuators but those at sites that inputs name."""
     spec = mujoco.MjSpec.from_file(str(path))
     controls = {target for target in config.inputs.values() if target.endswith(".ctrl")}
     _strip(spec, [a for a in spec.actuators if not (f"{a.name}.ctrl" in controls and _at_site(a))])
@@ -81,7 +103,10 @@ def _spec(path: Path, config: MuJoCoConfig) -> Any:
 
 def _strip(spec: Any, actuators: Sequence[Any] = ()) -> None:
     """Takes out what moves nothing, and these actuators."""
-    for elements in (spec.keys, spec.tuples, spec.sensors, actuators, spec.cameras, spec.lights):
+    for material in spec.materials:
+        material.textures = [""] * len(material.textures)
+    unmoving = (spec.keys, spec.tuples, spec.sensors, spec.cameras, spec.lights, spec.textures, spec.skins)
+    for elements in (*unmoving, actuators):
         for element in list(elements):
             spec.delete(element)
 
@@ -141,7 +166,8 @@ def _motor(model: Any, k: int, joint: int) -> Motor:
 
 def _set_base(spec: Any, path: Path, fixed: bool) -> None:
     free = [j for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_FREE]
-    if fixed and free:
+    # Beside a robot that stands fast, bodies may be free that carry no joint.
+    if fixed and free and (len(free) == len(spec.joints) or any(len(j.parent.find_all("joint")) > 1 for j in free)):
         raise UsageError(f"backend.robot: {path} has a base with a free joint; set fixed_base: false, or take the joint out")
     if fixed or free:
         return
@@ -169,6 +195,10 @@ def _set_options(spec: Any, config: MuJoCoConfig) -> None:
             setattr(option, name, chosen)
     if config.gravity is not None:
         option.gravity = config.gravity
+    elif option.disableflags & int(_DISABLE.mjDSBL_GRAVITY):
+        option.gravity = [0.0, 0.0, 0.0]
+    # Where it is off, it is zero: a number like any other.
+    option.disableflags &= ~int(_DISABLE.mjDSBL_GRAVITY)
     # A reset in the middle of a query would answer for another state; sleeping bodies would remember earlier queries.
     option.disableflags |= int(_DISABLE.mjDSBL_AUTORESET | _DISABLE.mjDSBL_SENSOR)
     option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP | mujoco.mjtEnableBit.mjENBL_ENERGY)
@@ -254,17 +284,75 @@ def scalar(model: Any) -> npt.NDArray[np.bool_]:
     return np.isin(model.jnt_type, _SCALAR)
 
 
-def floating(model: Any) -> tuple[int, int]:
-    """Where the free joint's positions and velocities start."""
-    free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
-    return (int(model.jnt_qposadr[free[0]]), int(model.jnt_dofadr[free[0]])) if len(free) else (0, 0)
+@final
+@dataclass(frozen=True)
+class Loose:
+    """A free joint, or a ball: where its positions and velocities start, and what its columns are called."""
+
+    name: str
+    ball: bool
+    q: int
+    v: int
+
+    @property
+    def columns(self) -> tuple[StateSpec, ...]:
+        return ball_columns(self.name) if self.ball else body_columns(self.name)
+
+    def rest(self, model: Any) -> tuple[float, ...]:
+        """Its columns in the file's pose."""
+        turns, moves = (4, 3) if self.ball else (7, 6)
+        return (*model.qpos0[self.q : self.q + turns].tolist(), *[0.0] * moves)
+
+
+def loose(model: Any, *, fixed_base: bool) -> list[Loose]:
+    """The base first, where it floats: what carries joints, or else the first free body."""
+    found = []
+    for j in np.flatnonzero(~scalar(model)).tolist():
+        ball = bool(model.jnt_type[j] == mujoco.mjtJoint.mjJNT_BALL)
+        body = int(model.jnt_bodyid[j])
+        name = joint_name(model, j) if ball else str(model.body(body).name) or f"body{body}"
+        carries = np.count_nonzero(model.body_rootid[model.jnt_bodyid] == model.body_rootid[body]) > 1
+        one = Loose(name, ball, int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j]))
+        found.append((fixed_base or ball or not carries, ball, one))
+    return [one for *_, one in sorted(found, key=lambda f: f[:2])] if not fixed_base else [one for *_, one in found]
 
 
 def unconstrained(model: Any) -> bool:
     """Can no constraint ever act: no limit, dry friction, equality, or pair of geoms that may touch?"""
     limited = model.jnt_limited.any() or model.tendon_limited.any()
     dry = model.dof_frictionloss.any() or model.tendon_frictionloss.any()
-    return not (limited or dry or model.neq or touches(model))
+    return not (limited or dry or model.eq_active0.any() or touches(model))
+
+
+def beyond(model: Any) -> list[str]:
+    """What acts besides bodies on hinges and slides, their springs, damping and dry friction, and the ends of joints."""
+    off, option = model.opt.disableflags, model.opt
+    idle = {"constraints": _DISABLE.mjDSBL_CONSTRAINT, "limits": _DISABLE.mjDSBL_LIMIT, "springs": _DISABLE.mjDSBL_SPRING}
+    idle |= {"damping": _DISABLE.mjDSBL_DAMPER, "dry friction": _DISABLE.mjDSBL_FRICTIONLOSS}
+    held = (model.tendon_stiffness, model.tendon_damping, model.tendon_frictionloss, model.tendon_limited)
+    tendons = [*held, model.tendon_stiffnesspoly, model.tendon_dampingpoly, model.tendon_armature]
+    found = {
+        "joints that are balls or free": not scalar(model).all(),
+        "springs or dampers that bend": np.any(model.jnt_stiffnesspoly) or np.any(model.dof_dampingpoly),
+        f"tendon {_first(model.tendon, tendons)}": any(map(np.any, tendons)),
+        f"equality {_first(model.equality, [model.eq_active0])}": model.eq_active0.any(),
+        "deformable bodies": model.nflex,
+        "a medium": option.density or option.viscosity or np.any(option.wind),
+        "geoms that may touch": touches(model),
+        "motors at sites": model.nu,
+        f"integrator {mujoco.mjtIntegrator(int(option.integrator)).name.removeprefix('mjINT_').lower()}": (
+            option.integrator not in SCHEMES
+        ),
+        **{f"{what} that the file switches off": off & int(flag) for what, flag in idle.items()},
+    }
+    return [what for what, there in found.items() if there]
+
+
+def _first(named: Any, parts: Sequence[Any]) -> str:
+    """The name of the first element of which anything is there."""
+    there = [np.flatnonzero(np.asarray(part).reshape(len(part), -1).any(axis=1)) for part in parts if len(part)]
+    rows = [int(r[0]) for r in there if len(r)]
+    return (str(named(min(rows)).name) or f"number {min(rows)}") if rows else ""
 
 
 def left_over(model: Any) -> float:

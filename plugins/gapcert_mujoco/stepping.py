@@ -17,7 +17,7 @@ from gapcert import Array
 from gapcert.plugin import cross
 from gapcert_engines import Drive
 
-from .robot import floating
+from .robot import loose
 
 _FORCE = int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 _PUSHED = _FORCE | int(mujoco.mjtState.mjSTATE_CTRL)
@@ -132,7 +132,7 @@ class Motors:
 
     def __init__(self, drive: Drive, model: Any) -> None:
         self.drive = drive
-        self._free = floating(model)
+        self._free = next(((one.q, one.v) for one in loose(model, fixed_base=False)), (0, 0))
         motors = {model.actuator(k).name: k for k in range(model.nu)}
         self.joints = np.array([k for k, name in enumerate(drive.elements) if name in motors], dtype=np.intp)
         self.belts = np.array([k for k, name in enumerate(drive.elements) if name not in motors], dtype=np.intp)

@@ -12,7 +12,7 @@ from gapcert import Array, UsageError
 from gapcert_engines import Drive, EngineWorld
 
 from .parameters import Natives
-from .robot import floating, idle, scalar, unconstrained
+from .robot import idle, loose, scalar, unconstrained
 from .stepping import Broken, Motors, Rollouts, Rows, turned, unheard
 from .xla import Compiled
 
@@ -33,7 +33,7 @@ class MuJoCoWorld(EngineWorld):
         self._unconstrained = unconstrained(one)
         single = scalar(many)
         self._position, self._velocity = many.jnt_qposadr[single], many.jnt_dofadr[single]
-        self._floats, self._floating = not single.all(), floating(many)
+        self._floats, self._loose = not single.all(), loose(many, fixed_base=config.fixed_base)
         self._values: dict[str, float] = {}
         self._stepper: Rollouts | Rows | Compiled | None = None
         self._alone: MuJoCoWorld | None = None
@@ -93,17 +93,22 @@ class MuJoCoWorld(EngineWorld):
                 part.reshape(len(state), self.copies, -1)[:] = joints[:, :, field].reshape(len(state), self.copies, -1)
             else:
                 part[:, places] = joints[:, :, field]
-        if base is not None:
-            q, v = self._floating
-            length = np.linalg.norm(base[:, 3:7], axis=1, keepdims=True)
+        at = 0
+        for one in self._loose if base is not None else ():
+            q, v, place = 1 + one.q, 1 + nq + one.v, 0 if one.ball else 3
+            own = base[:, at : at + place + 4 + place + 3]
+            at += own.shape[1]
+            rotation = own[:, place : place + 4]
+            length = np.linalg.norm(rotation, axis=1, keepdims=True)
             if not length.all():
-                row = int(np.flatnonzero(length == 0)[0])
-                raise UsageError(f"MuJoCo: the rotation of the base in row {row} is (0, 0, 0, 0); expected a unit quaternion")
-            rotation = base[:, 3:7] / length
-            state[:, 1 + q : 4 + q], state[:, 4 + q : 8 + q] = base[:, :3], rotation
-            rates = state[:, 1 + nq + v : 7 + nq + v]
+                row, floats = int(np.flatnonzero(length == 0)[0]), not self._config.fixed_base
+                what = "the base" if floats and one is self._loose[0] else one.name
+                raise UsageError(f"MuJoCo: the rotation of {what} in row {row} is (0, 0, 0, 0); expected a unit quaternion")
+            rotation = rotation / length
+            state[:, q : q + place], state[:, q + place : q + place + 4] = own[:, :place], rotation
+            state[:, v : v + place] = own[:, place + 4 : -3]
             # MuJoCo turns a free body in its own frame, and moves it in the world's.
-            rates[:, :3], rates[:, 3:] = base[:, 7:10], turned(rotation, base[:, 10:], back=True)
+            state[:, v + place : v + place + 3] = own[:, -3:] if one.ball else turned(rotation, own[:, -3:], back=True)
         return state
 
     def _force(self, effort: Array) -> Array:
@@ -127,10 +132,13 @@ class MuJoCoWorld(EngineWorld):
         return joints.reshape(len(after) * self.copies, nj, 2)
 
     def _base(self, after: Array) -> Array:
-        (q, v), nq = self._floating, self._many.nq
-        rates = after[:, 1 + nq + v : 7 + nq + v]
-        rotation = after[:, 4 + q : 8 + q]
-        return np.concatenate([after[:, 1 + q : 8 + q], rates[:, :3], turned(rotation, rates[:, 3:])], axis=1)
+        parts, nq = list[Array](), self._many.nq
+        for one in self._loose:
+            q, v, place = 1 + one.q, 1 + nq + one.v, 0 if one.ball else 3
+            pose, rates = after[:, q : q + place + 4], after[:, v : v + place + 3]
+            spin = rates[:, place:] if one.ball else turned(pose[:, place:], rates[:, place:])
+            parts += [pose, rates[:, :place], spin]
+        return np.concatenate(parts, axis=1)
 
     def _complain(self, broken: Broken, joints: Array, effort: Array, base: Array | None) -> NoReturn:
         rows = slice(broken.row * self.copies, (broken.row + 1) * self.copies)

@@ -59,15 +59,13 @@ class PyBulletEngine(Engine):
 
     def section(
         self, coordinates: Sequence[str], period: float, free: Mapping[str, str], values: Mapping[str, float]
-    ) -> dict[str, Any] | None:
+    ) -> dict[str, Any]:
         """See Engine.section; with Bullet's drag.
 
         Bullet takes damping from the velocity at the beginning of a step. Its drag holds every link back by m v k (1 + |v|) at
         its centre of mass, and by I ω l (1 + |ω|), with k its linear and l its angular damping (btMultiBody).
         """
         out, drag = super().section(coordinates, period, free, values), {}
-        if out is None:
-            return None
         for what, square in (("linear", "second/metre"), ("angular", "second")):
             name, number = free.get(f"{what}_damping"), self.stated[f"{what}_damping"]
             if name is not None:
@@ -79,9 +77,10 @@ class PyBulletEngine(Engine):
             body["drag"] = drag
         return out
 
-    def links(self, coordinates: Mapping[str, str], period: float, values: Mapping[str, float]) -> list[Link] | None:
-        if self.config.touches:
-            return None
+    def beyond(self) -> tuple[str, ...]:
+        return (*super().beyond(), *(["shapes that may touch"] if self.config.touches else []))
+
+    def links(self, coordinates: Mapping[str, str], period: float, values: Mapping[str, float]) -> list[Link]:
         client = Client(self.robot, self.config, 1)
         try:
             return _links(client, coordinates, self.stated)

@@ -607,15 +607,12 @@ FILES = {
     "broken": ("<mujoco><worldbody>", {}, "MuJoCo cannot load"),
     "refused by the engine": ("<mujoco><worldbdy/></mujoco>", {}, "MuJoCo cannot load .* unrecognized element"),
     "no joint": ("<mujoco><worldbody/></mujoco>", {}, "no movable joint"),
-    "a ball": (CHAIN.replace("</worldbody>", BALL + "</worldbody>"), {}, "joint 'eye' is a ball; expected hinges and slides"),
-    "fixed and free": (CRATE.format(at="0 0 0", geom="", more=""), {}, "free joint; set fixed_base: false"),
-    "two bases": (
-        CRATE.format(at="0 0 0", geom="", more="").replace(
-            "</worldbody>", '<body><freejoint/><geom size="1"/></body></worldbody>'
-        ),
-        {"fixed_base": False},
-        "2 free joints",
+    "a ball by one number": (
+        CHAIN.replace("</worldbody>", BALL + "</worldbody>"),
+        {"states": {"a": "eye.position"}},
+        r"found 'eye.position'; expected one of eye.wx, eye.wy, eye.wz",
     ),
+    "fixed and free": (CRATE.format(at="0 0 0", geom="", more=""), {}, "free joint; set fixed_base: false"),
     "no base": (CHAIN, {"fixed_base": False}, "no base that could float"),
     "massless base": (ROBOT.read_text(), {"fixed_base": False}, "no base that could float"),
     "surface with a gain": (

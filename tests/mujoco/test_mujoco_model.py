@@ -74,19 +74,6 @@ def test_a_tree_moves_as_in_the_engine(tmp_path, integrator, damping, substeps):
     np.testing.assert_allclose(model.fast_rollout(x, u).x, system.rollout(at, u).x[:, :, order], rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("change", "told"),
-    [
-        (('axis="0 1 0"', 'axis="0 1 0" stiffness="3"'), "more than a tree of bodies"),
-        (('integrator="Euler"', 'integrator="implicit"'), "more than a tree of bodies"),
-        (('integrator="Euler"', 'integrator="Euler" density="1.2"'), "more than a tree of bodies"),
-    ],
-)
-def test_what_is_more_than_bodies_on_joints_is_refused(tmp_path, change, told):
-    with pytest.raises(gc.UsageError, match=told):
-        simulation(backend(tmp_path, ROD.format(integrator="Euler").replace(*change)))
-
-
 def test_states_must_be_complete_and_named_alike(tmp_path):
     text = ROD.format(integrator="Euler")
     for named, told in (

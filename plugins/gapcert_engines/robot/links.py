@@ -32,7 +32,8 @@ class Link:
     stand the joint's `axis`, `com` (m) and `inertia` about com (xx, yy, zz, xy, xz, yz in kg·m²). `coordinate` turns it about
     the axis, or pushes it along the axis where the joint is `straight`; None: welded. `name` and `joint` are the engine's. The
     joint has inertia of its own (`armature`), `damping` and dry friction (`dry`), None where the engine has no such thing, and
-    a spring that pulls it to `rest` (rad or m). soft: (compliance, rate) of dry friction that gives way, None where it holds.
+    a spring that pulls it to `rest` (rad or m). Something else carries the share `lifted` of its weight. soft: (compliance,
+    rate) of dry friction that gives way, None where it holds.
     The engine has its frame for the centre of mass at `origin` (m) and along the joint's axes, and calls this inertia `moment`
     (kg·m²), None where it has no parameter for that.
     """
@@ -54,6 +55,7 @@ class Link:
     soft: tuple[float, float] | None = None
     stiffness: float = 0.0
     rest: float = 0.0
+    lifted: float = 0.0
     origin: Vector = (0.0, 0.0, 0.0)
     moment: float | None = None
 
@@ -76,19 +78,22 @@ def as_section(
     *,
     implicit: bool,
     after: bool = False,
+    springs: bool = True,
     integrator: str = "semi_implicit",
 ) -> dict[str, Any]:
     """`parameters`, `bodies`, `gravity`, `forces` and friction of the joints, and `integrator`.
 
     gravity in m/s²; free: native parameters (`mass.LINK`, `com_x.LINK`, `inertia.LINK`, `damping.JOINT`, `gravity_x`, …) →
-    names of parameters that stand for their numbers; the inertia follows a mass that is free. implicit: with damping c and
-    stiffness k solved with the step of h seconds, (M + h (c + h k)) v̇ = forces − c v − k (q − rest + h v); dry friction does
-    not feel them where it comes `after`.
+    names of parameters that stand for their numbers; the inertia follows a mass that is free. implicit: with damping c and, of
+    `springs`, stiffness k solved with the step of h seconds, (M + h (c + h k)) v̇ = forces − c v − k (q − rest + h v); dry
+    friction does not feel them where it comes `after`.
     """
     values, bodies, forces, dry = _Values(free), dict[str, Any](), dict[str, str](), dict[str, str]()
     held, soft, h = dict[str, str](), dict[str, dict[str, float]](), _substep(links, free)
     for k, link in enumerate(links):
         body: dict[str, Any] = {"at": list(link.place), "turned": list(link.turn)} | values.inertia(link)
+        if link.lifted:
+            body["lifted"] = repr(link.lifted)
         if link.parent is not None:
             body["on"] = link.parent
         if (q := link.coordinate) is not None:
@@ -102,11 +107,12 @@ def as_section(
             if stiffness is not None:
                 rest = values.joint(link, k, "rest")
                 stretch = f"{q} - {rest}" if rest is not None else q
-                pulls.append(f"-{stiffness}*({stretch} + {h}*{q}_dot)" if implicit else f"-{stiffness}*({stretch})")
-                late.append(f"{h}*{stiffness}")
+                held_too = implicit and springs
+                pulls.append(f"-{stiffness}*({stretch} + {h}*{q}_dot)" if held_too else f"-{stiffness}*({stretch})")
+                late += [f"{h}*{stiffness}"] if held_too else []
             if pulls:
                 forces[q] = " ".join(pulls)
-                held |= {q: " + ".join(late)} if implicit else {}
+                held |= {q: " + ".join(late)} if implicit and late else {}
             if friction is not None:
                 dry[q] = friction
             if link.soft is not None:

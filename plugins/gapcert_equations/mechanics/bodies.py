@@ -64,9 +64,9 @@ class _Body:
     """A body on its `parent` (index, −1: the world). Its frame is the joint's: at `place` in the parent's frame, turned by
     `turn` (3, 3) when q = 0; `axis` is the joint's unit vector there, `kind` what q does along it: revolute, prismatic, or
     fixed, where there is no q. drag (a, b, c, d) is the force −m v (a + b |v|) on the centre of mass and the torque
-    −I ω (c + d |ω|).
+    −I ω (c + d |ω|). Of its weight the share `lifted` is carried by something else.
 
-    place, mass, com, inertia (3, 3) about com, drag: numbers or Values.
+    place, mass, com, inertia (3, 3) about com, drag, lifted: numbers or Values.
     """
 
     parent: int
@@ -78,6 +78,7 @@ class _Body:
     com: Vector
     inertia: Matrix
     drag: Sequence[Any]
+    lifted: Any
 
 
 def _body(name: str, b: BodyConfig, earlier: list[str], config: EquationsConfig, number: Callable[[str, str], Any]) -> _Body:
@@ -98,6 +99,7 @@ def _body(name: str, b: BodyConfig, earlier: list[str], config: EquationsConfig,
         com,
         _array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]),
         [number(f"bodies.{name}.drag.{k}.{i}", t) for k in ("linear", "angular") for i, t in enumerate(getattr(b.drag, k))],
+        number(f"bodies.{name}.lifted", b.lifted),
     )
 
 
@@ -179,6 +181,8 @@ def _mass(bodies: Sequence[_Body], turns: list[Matrix], places: list[Vector]) ->
 
 def _bias(bodies: Sequence[_Body], turns: list[Matrix], places: list[Vector], v: Sequence[Any], gravity: Vector) -> list[Any]:
     zero, dragged = _array([0.0, 0.0, 0.0]), any(isinstance(d, Value) or d for b in bodies for d in b.drag)
+    carried = any(isinstance(b.lifted, Value) or b.lifted for b in bodies)
+    down: list[Vector] = []
     spin: list[Vector] = []
     speed: list[Vector] = []
     turning: list[Vector] = []
@@ -207,6 +211,9 @@ def _bias(bodies: Sequence[_Body], turns: list[Matrix], places: list[Vector], v:
         if dragged:
             push, twist = _drag(b, move + _cross(here, b.com), here, momentum)
             force, torque = force + push, torque + twist
+        if carried:
+            down.append(turns[i].T @ (down[b.parent] if b.parent >= 0 else gravity))
+            force = force + down[i] * (b.mass * b.lifted)
         torque = torque + _cross(b.com, force)
         for known, new in zip(
             (spin, speed, turning, rising, forces, torques), (here, move, turn, rise, force, torque), strict=True

@@ -155,9 +155,10 @@ class _Expressions:
             own += [("at", body.at, METRE, "a place"), ("com", body.com, METRE, "a place")]
             own += [("inertia", body.inertia, INERTIA, "an inertia")]
             own += [("armature", (body.armature,), KILOGRAM if straight else INERTIA, "an inertia")]
+            own += [("lifted", (body.lifted,), NONE, "a share")]
             for section, texts, wanted, what in own:
                 for i, text in enumerate(texts):
-                    path: Path = ("bodies", name, section) if section in ("mass", "armature") else ("bodies", name, section, i)
+                    path: Path = ("bodies", name, section) if len(texts) == 1 else ("bodies", name, section, i)
                     if constant(parse(text)) is None:
                         self._expect(path, text, wanted, what, self.parameters)
             for section, squared in (("linear", times(NONE, METRE, -1)), ("angular", NONE)):
