@@ -18,7 +18,7 @@ from gapcert_engines.thresholds import THRESHOLDS
 from .backend import EngineBackend
 from .config import EngineConfig
 from .contract import Engine
-from .native_model import NativeModel, in_contact
+from .native_model import NativeModel, in_contact, refuse_driven
 from .settings import changed, declared, flat, short
 from .wiring import hint
 
@@ -101,7 +101,8 @@ class EngineModel(Model):
         if not isinstance(backend, EngineBackend):
             raise UsageError(f"model.of: '{config.of.kind}' is no physics engine on its own; expected an engine's section")
         if backend.engine.beyond():
-            return _rolled(config, of, context)
+            refuse_driven(backend.config)
+            return _rolled(config, of, context, backend)
         stated = {p.name: p for p in backend.parameters}
         return cls(backend, _toleranced(config.parameters, stated))
 
@@ -254,10 +255,10 @@ class EngineModel(Model):
         ]
 
 
-def _rolled(config: EngineModelConfig, of: EngineConfig, context: Context) -> NativeModel:
-    model = NativeModel(of, context)
+def _rolled(config: EngineModelConfig, of: EngineConfig, context: Context, backend: EngineBackend | None = None) -> NativeModel:
+    model = NativeModel(of, context, backend=backend)
     known = _toleranced(config.parameters, {p.name: p for p in model.backend.parameters})
-    return NativeModel(of, context, known) if known else model
+    return NativeModel(of, context, known, backend=model.backend) if known else model
 
 
 def _native_parameters(backend: EngineBackend) -> dict[str, Parameter]:

@@ -62,9 +62,17 @@ class NativeModel(Model):
     It can be rolled out under other native parameters and under other settings; it has no equations.
     """
 
-    def __init__(self, of: EngineConfig, context: Context, parameters: Sequence[Parameter] = (), values: Any = None) -> None:
+    def __init__(
+        self,
+        of: EngineConfig,
+        context: Context,
+        parameters: Sequence[Parameter] = (),
+        values: Any = None,
+        *,
+        backend: EngineBackend | None = None,
+    ) -> None:
         self.of, self.context = of, replace(context, model=None)
-        self.backend = _backend(of, self.context)
+        self.backend = _backend(of, self.context) if backend is None else backend
         stated = {p.name: p for p in self.backend.parameters}
         self.stated = {p.name: p for p in parameters}
         self.values = {n: float(v) for n, v in (values or {n: p.value for n, p in self.stated.items()}).items()}
@@ -199,18 +207,22 @@ class NativeModel(Model):
 
 
 def in_contact(of: EngineConfig) -> bool:
-    """Is there a base that floats, or a ground?"""
-    return not of.fixed_base or of.ground is not None
+    """Is there a base that floats, a ground, or a rotation?"""
+    return not of.fixed_base or of.ground is not None or any(t.endswith(".rotation") for t in of.states.values())
+
+
+def refuse_driven(of: EngineConfig) -> None:
+    if of.drive is not None:
+        raise UsageError("model.of.drive: a diagnosis by rollouts knows no drive; give efforts at joints as inputs")
 
 
 def _backend(of: EngineConfig, context: Context) -> EngineBackend:
     """The engine, with states that it knows; what none of them says is hidden state there."""
+    refuse_driven(of)
     own = {n: t for n, t in of.states.items() if not t.endswith(".rotation") and t not in _BODY}
     if not own:
         raise UsageError("model.of.states: there is no position in it; expected all numbers of the robot, such as x: base.x")
     kind = getattr(of, "kind", "")
-    if of.drive is not None:
-        raise UsageError("model.of.drive: a diagnosis by rollouts knows no drive; give efforts at joints as inputs")
     if of.rotation != "quaternion":
         raise UsageError("model.of.rotation: found 'euler'; expected quaternion, the state base.rotation")
     backend: EngineBackend = registry().build("backend", kind, of.model_copy(update={"states": own}), context)

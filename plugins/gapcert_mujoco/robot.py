@@ -28,6 +28,8 @@ SCHEMES = {
     mujoco.mjtIntegrator.mjINT_RK4: "rk4",
 }
 """Integrators that equations have, too."""
+_ROUND = (mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER)
+"""What tendons lie around."""
 _ALL = 2**31 - 1
 """The bit mask of a geom that meets all others."""
 _SMALLEST = 1e-15
@@ -42,20 +44,18 @@ def compiled(path: Path, config: MuJoCoConfig, copies: int = 1) -> Any:
         path.read_text(encoding="utf-8")
     except UnicodeDecodeError:  # MuJoCo takes it, and its names are none
         raise UsageError(f"backend.robot: {path} is not UTF-8 text; expected an MJCF or URDF file") from None
-    # MuJoCo keeps meshes by name and time in seconds: one that is edited within a second would be missed.
-    mujoco.mj_clearCache(mujoco.mj_getCache())
     try:
-        smallest = 0.0
-        one = _compiled(path, config, 1, smallest)
+        return _compiled(path, config, copies, 0.0)
     except ValueError as error:
         # A thin rod in a URDF may have no moment of inertia about its own axis.
-        smallest = _SMALLEST
         try:
-            one = _compiled(path, config, 1, smallest)
+            return _compiled(path, config, copies, _SMALLEST)
         except ValueError:
             said = " ".join(str(error).split())
             raise UsageError(f"backend.robot: MuJoCo cannot load {path}: {said}; expected a valid MJCF or URDF file") from None
-    return one if copies == 1 else _compiled(path, config, copies, smallest)
+    finally:
+        # MuJoCo keeps meshes by name and time in seconds: one that is edited within a second would be missed.
+        mujoco.mj_clearCache(mujoco.mj_getCache())
 
 
 def _compiled(path: Path, config: MuJoCoConfig, copies: int, smallest: float) -> Any:
@@ -73,12 +73,14 @@ def _compiled(path: Path, config: MuJoCoConfig, copies: int, smallest: float) ->
 def _bare(spec: Any) -> None:
     """Takes out shapes, once bodies have the inertia that these give them: copies share a model where nothing touches."""
     model = spec.compile()
+    wrapped = model.wrap_objid[np.isin(model.wrap_type, _ROUND)].tolist()
     for body in list(spec.bodies)[1:]:
         body.mass, body.ipos, body.iquat = model.body_mass[body.id], model.body_ipos[body.id], model.body_iquat[body.id]
         body.inertia, body.fullinertia, body.explicitinertial = model.body_inertia[body.id], [np.nan, *[0.0] * 5], True
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
     spec.compiler.settotalmass, spec.compiler.balanceinertia = -1, False
-    for elements in (spec.pairs, spec.excludes, [g for g in spec.geoms if not g.fluid_ellipsoid], spec.meshes, spec.hfields):
+    idle = [g for g in spec.geoms if not g.fluid_ellipsoid and g.id not in wrapped]
+    for elements in (spec.pairs, spec.excludes, idle, spec.meshes, spec.hfields):
         for element in list(elements):
             spec.delete(element)
 
@@ -130,6 +132,11 @@ def motors(path: Path) -> tuple[Motor, ...]:
     if not list(spec.actuators):
         return ()
     _strip(spec)
+    for geom in spec.geoms:
+        if geom.meshname:  # What they look like is not asked.
+            geom.meshname, geom.type, geom.size = "", mujoco.mjtGeom.mjGEOM_SPHERE, [0.01, 0.0, 0.0]
+    for mesh in list(spec.meshes):
+        spec.delete(mesh)
     try:
         model = spec.compile()
     except ValueError:  # What is wrong with the robot is told where it is compiled without them.
