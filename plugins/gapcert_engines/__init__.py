@@ -10,8 +10,8 @@ _HOME = homes(
     {
         "gapcert_engines.backend": "EngineBackend as_backend",
         "gapcert_engines.config": "Coefficient EngineConfig",
-        "gapcert_engines.contract": "ABSURD BodyInertia Drive Engine EngineWorld Joint JointType Motor Thruster "
-        "ball_columns body_columns",
+        "gapcert_engines.contract": "ABSURD BodyInertia Drive Engine EngineWorld Joint JointType Law Motor "
+        "Actuator ball_columns body_columns",
         "gapcert_engines.equations_model": "PHYSICAL EngineModel",
         "gapcert_engines.native_model": "Group NativeModel",
         "gapcert_engines.robot.description": "RobotDescription chosen_model read_robot",
@@ -20,7 +20,7 @@ _HOME = homes(
         "gapcert_engines.robot.shapes": "file_shapes",
         "gapcert_engines.settings": "Options changed declared flat plain short",
         "gapcert_engines.silence": "muted",
-        "gapcert_engines.wiring": "check_ranges step_period",
+        "gapcert_engines.wiring": "UNITS check_ranges step_period",
     }
 )
 

@@ -3,14 +3,15 @@ from gapcert_engines.backend import as_backend as as_backend
 from gapcert_engines.config import Coefficient as Coefficient
 from gapcert_engines.config import EngineConfig as EngineConfig
 from gapcert_engines.contract import ABSURD as ABSURD
+from gapcert_engines.contract import Actuator as Actuator
 from gapcert_engines.contract import BodyInertia as BodyInertia
 from gapcert_engines.contract import Drive as Drive
 from gapcert_engines.contract import Engine as Engine
 from gapcert_engines.contract import EngineWorld as EngineWorld
 from gapcert_engines.contract import Joint as Joint
 from gapcert_engines.contract import JointType as JointType
+from gapcert_engines.contract import Law as Law
 from gapcert_engines.contract import Motor as Motor
-from gapcert_engines.contract import Thruster as Thruster
 from gapcert_engines.contract import ball_columns as ball_columns
 from gapcert_engines.contract import body_columns as body_columns
 from gapcert_engines.equations_model import PHYSICAL as PHYSICAL
@@ -37,5 +38,6 @@ from gapcert_engines.settings import flat as flat
 from gapcert_engines.settings import plain as plain
 from gapcert_engines.settings import short as short
 from gapcert_engines.silence import muted as muted
+from gapcert_engines.wiring import UNITS as UNITS
 from gapcert_engines.wiring import check_ranges as check_ranges
 from gapcert_engines.wiring import step_period as step_period

@@ -17,13 +17,13 @@ from gapcert.plugin import Array, Backend, Capability, Context, Parameter, Scene
 from gapcert_engines.thresholds import THRESHOLDS
 
 from .config import EngineConfig
-from .contract import ENDLESS, Engine, EngineWorld, Joint
+from .contract import ENDLESS, Engine, EngineWorld, Joint, Law
 from .wiring import Lever, check_ranges, from_columns, step_period, to_columns, wire
 
 
 @final
 class EngineBackend(Backend):
-    """x⁺ of the numbers that `states` names, under one effort per joint or thruster (or one command to the drive) and period.
+    """x⁺ of the numbers that `states` names, under one effort per joint, or control per actuator, and period.
 
     Every number of the robot that no state names is hidden state; its default is the file's pose at rest. `parameters` are the
     engine's native ones.
@@ -95,9 +95,14 @@ class EngineBackend(Backend):
         return list(zip(self._joints, self.coordinates, strict=True))
 
     def driven(self, name: str) -> str | None:
-        """The coordinate at which an input is an effort; None where it goes to the drive or to a thruster."""
+        """The coordinate at which an input is an effort; None where it goes to the drive or to an actuator."""
         joint = int(self._wiring.driven[[u.name for u in self.inputs].index(name)])
         return self.coordinates[joint] if 0 <= joint < len(self.coordinates) else None
+
+    def law(self, name: str) -> Law | None:
+        """Of the actuator at an input that stays in the engine."""
+        place = int(self._wiring.driven[[u.name for u in self.inputs].index(name)]) - len(self.coordinates)
+        return self.engine.actuators[place].law if place >= 0 else None
 
     def lever(self, name: str) -> Lever | None:
         """The motor at an input."""
@@ -130,7 +135,7 @@ class EngineBackend(Backend):
         joints, base = self._robot(x, options.get("hidden", 0.0))
         command = None if w.drive is None else w.drive.commands(u[:, w.commanded])
         forces = options.get("forces")
-        effort = np.zeros((n, 1 if forces is None else self.substeps, nj + len(self.engine.thrusters)))
+        effort = np.zeros((n, 1 if forces is None else self.substeps, nj + len(self.engine.actuators)))
         given = dict(options.get("parameters", {}))
         effort[:, :, w.driven[w.driven >= 0]] = self._levered(u, given)[:, None, w.driven >= 0]
         if forces is not None:
@@ -254,7 +259,7 @@ class EngineBackend(Backend):
         rng = np.random.default_rng(0)
         n, nj = 3 * copies, len(self._joints)
         joints = rng.uniform(-1, 1, (n, nj, 2)) * [np.pi, 10]
-        effort = rng.uniform(-10, 10, (n, self.substeps, nj + len(self.engine.thrusters)))
+        effort = rng.uniform(-10, 10, (n, self.substeps, nj + len(self.engine.actuators)))
         for given in (effort[:, :1], effort)[: 1 + (self.substeps > 1)]:
             worlds = self._ready(1, self._nominal), self._ready(copies, self._nominal)
             try:

@@ -38,7 +38,8 @@ class DriveConfig(BaseModel):
 
 class EngineConfig(BaseModel, ABC):
     """`states` maps a state to `JOINT.position`, `JOINT.velocity` or, for a base that floats, `base.FIELD`; `inputs` maps an
-    input to the joint that its effort drives, to `MOTOR.ctrl` where the file has such a motor, or to `drive`.
+    input to the joint that its effort drives, to `ACTUATOR.ctrl`, the control of an actuator of the file, or to `drive`; an
+    effort in the place of such an actuator is `JOINT.effort`.
 
     Fields of the base, and of another body that is free, BODY.FIELD: x, y, z, vx, vy, vz, wx, wy, wz in the world's frame, and
     of the base with `rotation: euler` roll, pitch and yaw
@@ -54,7 +55,7 @@ class EngineConfig(BaseModel, ABC):
     fixed_base: bool = Field(True, description="is the base welded to the world, or does it float?")
     states: dict[str, str] = Field(min_length=1, description="state → `JOINT.position`, `JOINT.velocity` or `base.FIELD`")
     inputs: dict[str, str] = Field(
-        default_factory=dict, description="input → the joint that its effort drives, `MOTOR.ctrl` or `drive`"
+        default_factory=dict, description="input → the joint that its effort drives, `ACTUATOR.ctrl`, `JOINT.effort` or `drive`"
     )
     drive: DriveConfig | None = Field(None, description="the base's own loop, for inputs that are `drive`")
     rotation: Annotated[str, Field(pattern="^(quaternion|euler)$")] = Field(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, Literal, final
 
 import numpy as np
@@ -78,14 +79,42 @@ class Motor:
 
 @final
 @dataclass(frozen=True)
-class Thruster:
-    """An actuator of the file that is a force and a torque, gear · control, fixed to a body, as of a propeller.
+class Law:
+    """The effort of an actuator at one joint, gear · clip(gain · c + offset + position · l + velocity · l̇, forces), with c its
+    control, cut to `controls`, and l = gear · q.
 
-    The engine cuts its control, whose unit is stated, and turns it with the body in every sub-step.
+    held: where nothing is cut, what it takes from the rate is solved with the step.
+    """
+
+    joint: str
+    gear: float
+    gain: float
+    offset: float = 0.0
+    position: float = 0.0
+    velocity: float = 0.0
+    controls: tuple[float, float] = ENDLESS
+    forces: tuple[float, float] = ENDLESS
+    held: bool = False
+
+    @property
+    def commands(self) -> Literal["position", "velocity", "effort"]:
+        """What its control is: where it pulls the joint to, how fast, or how much."""
+        if self.gain and self.position == -self.gain:
+            return "position"
+        return "velocity" if self.gain and not self.position and self.velocity == -self.gain else "effort"
+
+
+@final
+@dataclass(frozen=True)
+class Actuator:
+    """An actuator that stays in the engine: it turns its control, whose unit is stated, into forces in every sub-step.
+
+    law: of one at a joint that equations can have; None of any other, such as a propeller fixed to a body.
     """
 
     name: str
     unit: str
+    law: Law | None = None
 
 
 @final
@@ -195,7 +224,7 @@ class EngineWorld(ABC):
         """One period: (joints, base) afterwards, as new arrays.
 
         joints (n, nj, 2): position and velocity of the movable joints, n a multiple of `copies`; effort (n, 1, nj + nt), held,
-        or (n, substeps, nj + nt): at the joints, and the controls of nt thrusters; base (n, ·): 13 numbers as BASE orders them,
+        or (n, substeps, nj + nt): at the joints, and the controls of nt actuators; base (n, ·): 13 numbers as BASE orders them,
         where it floats, then those of `Engine.beside`; command (n, m): mixing · inputs of the drive.
         The answer for a row must not depend on earlier rows: every query starts from a state that is set in full.
         """
@@ -209,12 +238,13 @@ class Engine(ABC):
     """A robot in a physics engine, described by plain data (it is pickled), and the worlds that step it.
 
     joints: all of them, in the engine's order; base: 13 default numbers where it floats, else empty; beside: what moves
-    besides, free bodies and ball joints, and its default numbers; parameters: what
-    `EngineWorld.set` takes, with the stated values; motors: at most one per joint; thrusters: those that inputs name; rowwise:
-    its worlds take native parameters row by row as well, `EngineWorld.set_rows`, so that queries which differ in them share a
-    batch; unsolved: the change of a state per second that a solver of constraints may leave undone; integrator: of its
-    equations, see `as_section`; friction_after: their dry friction does not feel damping that is solved with the step;
-    springs_held: where damping is solved with the step, so are springs.
+    besides, free bodies and ball joints, and its default numbers; parameters: what `EngineWorld.set` takes, with the stated
+    values; motors: at most one per joint; actuators: those that inputs name, where they are no motors; served: joints that
+    the file drives by what is no motor, and by which; rowwise: its worlds take native parameters row by row as well,
+    `EngineWorld.set_rows`, so that queries which differ in them share a batch; unsolved: the change of a state per second
+    that a solver of constraints may leave undone; integrator: of its equations, see `as_section`; friction_after: their dry
+    friction does not feel damping that is solved with the step; springs_held: where damping is solved with the step, so are
+    springs.
     """
 
     config: EngineConfig
@@ -225,7 +255,8 @@ class Engine(ABC):
     beside_default: tuple[float, ...] = ()
     parameters: tuple[Parameter, ...] = ()
     motors: tuple[Motor, ...] = ()
-    thrusters: tuple[Thruster, ...] = ()
+    actuators: tuple[Actuator, ...] = ()
+    served: Mapping[str, str] = MappingProxyType({})
     rowwise: bool = False
     unsolved: float = 0.0
     integrator: str = "semi_implicit"
@@ -283,11 +314,12 @@ class Engine(ABC):
 
     def beyond(self) -> tuple[str, ...]:
         """What acts besides bodies on hinges and slides, each as a phrase; where nothing does, `section` is exact."""
-        found = {
+        found: dict[str, object] = {
             "a base that floats": self.base,
             "free bodies or ball joints": self.beside,
             "a drive of its own": self.config.drive,
         }
+        found |= {f"actuator {a.name}": a.law is None for a in self.actuators}
         return tuple(what for what, there in found.items() if there)
 
     def section(

@@ -17,10 +17,10 @@ from gapcert_engines.thresholds import THRESHOLDS
 
 from .backend import EngineBackend
 from .config import EngineConfig
-from .contract import Engine
+from .contract import Engine, Law
 from .native_model import NativeModel, in_contact, refuse_driven
 from .settings import changed, declared, flat, short
-from .wiring import hint
+from .wiring import UNITS, hint
 
 if TYPE_CHECKING:
     from .model_config import EngineModelConfig
@@ -365,8 +365,15 @@ def _written(
             f"model.of: {backend.engine.file} is more than a tree of bodies on hinges and slides: {', '.join(more)}"
         )
     robot = backend.engine.section(names, backend.period, free, {p.name: p.value for p in parameters if p.name in there})
-    driven = {backend.driven(u.name): _effort(backend, u.name, free) for u in backend.inputs}
-    forces = {q: " ".join(t for t in (driven.get(q, ""), robot["forces"].get(q, "")) if t) for q in names}
+    driven: dict[str, list[str]] = {q: [] for q in names}
+    for u in backend.inputs:
+        if (law := backend.law(u.name)) is not None:
+            q = names[[j.name for j, _ in backend.moved()].index(law.joint)]
+            driven[q].append(_served(law, u, q, robot, units[q].unit))
+        elif (at := backend.driven(u.name)) is not None:
+            driven[at].append(_effort(backend, u.name, free))
+    pushes = {q: " + ".join(texts) for q, texts in driven.items()}
+    forces = {q: " ".join(t for t in (pushes[q], robot["forces"].get(q, "")) if t) for q in names}
     section = {
         **robot,
         "kind": "equations",
@@ -393,6 +400,45 @@ def _effort(backend: EngineBackend, name: str, free: Mapping[str, str]) -> str:
     if (gear := free.get(lever.native)) is not None:
         return f"{lever.factor(1.0)!r}*{gear}*{name}"
     return f"{lever.factor(lever.motor.gear)!r}*{name}" if lever.control else name
+
+
+def _served(law: Law, control: StateSpec, q: str, robot: dict[str, Any], unit: str) -> str:
+    """The effort of an actuator at its joint; its numbers become parameters, and its damping that of the step."""
+    force = UNITS["prismatic" if unit == "m" else "revolute"][2]
+    taken: dict[str, str] = robot["parameters"]
+
+    def number(name: str, value: float, per: str) -> str:
+        key = f"{name}_{control.name}"
+        taken[key] = f"{value!r} {force}{per}"
+        return key
+
+    def cut(text: str, low: str | None, high: str | None) -> str:
+        text = text if low is None else f"max({text}, {low})"
+        return text if high is None else f"min({text}, {high})"
+
+    gear = "" if law.gear == 1 else f"{law.gear!r}*"
+    command = cut(control.name, *(None if np.isinf(end) else repr(end) for end in law.controls))
+    at, rate = f"{gear}{q}", f"{gear}{q}_dot"
+    damping = number("damping", -law.velocity, f"/({unit}/s)") if law.velocity else ""
+    if law.commands == "position":
+        text = f"{number('stiffness', law.gain, f'/{unit}')}*({command} - {at})"
+    elif law.commands == "velocity":
+        text = f"{damping}*({command} - {rate})"
+    else:
+        text = f"{number('gain', law.gain, '')}*{command}"
+        text += f" + {number('stiffness', law.position, f'/{unit}')}*{at}" if law.position else ""
+    text += f" - {damping}*{rate}" if damping and law.commands != "velocity" else ""
+    text += f" + {number('offset', law.offset, '')}" if law.offset else ""
+    low, high = (
+        None if np.isinf(end) else number(name, end, "") for name, end in zip(("low", "high"), law.forces, strict=True)
+    )
+    if law.held and damping:
+        free = [f"max(sign({high} - ({text})), 0)"] if high else []
+        free += [f"max(sign({text} - {low}), 0)"] if low else []
+        held = "*".join([repr(law.gear**2), damping, *free])
+        late: dict[str, str] = robot.setdefault("implicit", {})
+        late[q] = f"{late[q]} + {held}" if q in late else held
+    return f"{gear}{cut(f'({text})' if gear and low is high is None else text, low, high)}"
 
 
 def _quantity(p: Parameter) -> dict[str, Any]:

@@ -14,11 +14,13 @@ import numpy.typing as npt
 from gapcert.plugin import Array, Parameter, StateSpec, System, UsageError, magnitude
 
 from .config import FEEDBACK, EngineConfig, seconds
-from .contract import BASE, BASE_EULER, Drive, Engine, Joint, Motor, Thruster
+from .contract import BASE, BASE_EULER, Actuator, Drive, Engine, Joint, Motor
 
 FIELDS = ("position", "velocity")
 CONTROL = ".ctrl"
-"""Of an input that is a motor's control, MOTOR.ctrl."""
+"""Of an input that is an actuator's control, ACTUATOR.ctrl."""
+EFFORT = ".effort"
+"""Of an input that is an effort at a joint which the file drives otherwise, JOINT.effort."""
 UNITS = {"revolute": ("rad", "rad/s", "N*m"), "prismatic": ("m", "m/s", "N")}
 """Units of position, velocity and effort."""
 
@@ -76,8 +78,9 @@ def wire(engine: Engine, model: System | None) -> Wiring:
     movable = [j for j in engine.joints if j.movable]
     columns = _columns(engine, movable)
     states = {name: _column(name, target, engine, columns) for name, target in config.states.items()}
-    levers = {name: _lever(f"inputs.{name}", t, engine) for name, t in config.inputs.items()}
-    joint = {name: t if (lever := levers[name]) is None else lever.motor.joint for name, t in config.inputs.items()}
+    targets = {name: _target(f"inputs.{name}", t, engine) for name, t in config.inputs.items()}
+    levers = {name: _lever(f"inputs.{name}", t, engine) for name, t in targets.items()}
+    joint = {name: t if (lever := levers[name]) is None else lever.motor.joint for name, t in targets.items()}
     inputs = {name: None if t == "drive" else _driven(f"inputs.{name}", t, engine) for name, t in joint.items()}
     if twice := [n for n, t in joint.items() if t != "drive" and list(joint.values()).count(t) > 1]:
         raise UsageError(
@@ -91,7 +94,7 @@ def wire(engine: Engine, model: System | None) -> Wiring:
     rest = np.array([(j.rest, 0.0) for j in movable]).ravel()
     default = np.concatenate([rest, to_columns(np.asarray(engine.loose)[None], config)[0]])
     spread = [c for k in unseen for c in range(starts[k], starts[k + 1])]
-    pushed = [*movable, *engine.thrusters]
+    pushed = [*movable, *engine.actuators]
     position = {target.rpartition(".")[0]: name for name, target in config.states.items() if target.endswith(".position")}
     return Wiring(
         x_axes,
@@ -139,7 +142,7 @@ def _axes(
     config: EngineConfig,
     model: System | None,
     states: Mapping[str, str],
-    inputs: Mapping[str, Joint | Thruster | None],
+    inputs: Mapping[str, Joint | Actuator | None],
     columns: Mapping[str, StateSpec],
 ) -> tuple[tuple[StateSpec, ...], tuple[StateSpec, ...]]:
     """The axes of x and u: the model's, whose units must be the engine's, or the engine's own."""
@@ -180,29 +183,38 @@ def _drive(engine: Engine, commands: Sequence[str]) -> Drive | None:
     return drive
 
 
+def _target(where: str, target: str, engine: Engine) -> str:
+    """Of an effort the joint. A command that is taken for an effort would run without an error, and mean nothing."""
+    if (by := engine.served.get(target)) is not None:
+        raise UsageError(
+            f"backend.{where}: {engine.file} drives joint '{target}' by its actuator '{by}'; give its command, {by}{CONTROL}, "
+            f"or say {target}{EFFORT} where the input is an effort in its place"
+        )
+    return target.removesuffix(EFFORT)
+
+
 def _lever(where: str, target: str, engine: Engine) -> Lever | None:
     """The motor that an input is the control of, or that makes the effort which it is."""
     at_joint, named = {m.joint: m for m in engine.motors}, {m.name: m for m in engine.motors}
     name = target.removesuffix(CONTROL)
-    if any(name == t.name for t in engine.thrusters):
+    if any(name == t.name for t in engine.actuators):
         return None
     if target in {j.name for j in engine.joints} or name == target:
         return Lever(at_joint[target], False) if target in at_joint else None
     if name not in named:
         raise UsageError(
-            f"backend.{where}: {engine.file} has no motor '{name}' that is a plain effort at one hinge or slide, alone there, "
-            f"or at a place on a body; {hint(name, named)}"
+            f"backend.{where}: {engine.file} has no actuator '{name}' without a memory of its own; {hint(name, named)}"
         )
     return Lever(named[name], True)
 
 
-def _unit(driven: Joint | Thruster) -> str:
-    return driven.unit if isinstance(driven, Thruster) else UNITS[driven.type][2]
+def _unit(driven: Joint | Actuator) -> str:
+    return driven.unit if isinstance(driven, Actuator) else UNITS[driven.type][2]
 
 
-def _driven(where: str, name: str, engine: Engine) -> Joint | Thruster:
-    thrusters = {t.name + CONTROL: t for t in engine.thrusters}
-    return thrusters[name] if name in thrusters else _find(where, name, engine)
+def _driven(where: str, name: str, engine: Engine) -> Joint | Actuator:
+    actuators = {t.name + CONTROL: t for t in engine.actuators}
+    return actuators[name] if name in actuators else _find(where, name, engine)
 
 
 def _find(where: str, name: str, engine: Engine) -> Joint:

@@ -22,6 +22,7 @@ from .parameters import Natives
 from .patch import patched, wrapper
 from .robot import (
     SCHEMES,
+    actuators,
     beyond,
     binary,
     compiled,
@@ -30,7 +31,6 @@ from .robot import (
     loose,
     motors,
     restored,
-    thrusters,
     unconstrained,
 )
 from .world import MuJoCoWorld
@@ -70,8 +70,8 @@ class MuJoCoEngine(Engine):
         floats = not config.fixed_base
         self.base, self.beside_default = poses[0] if floats else (), tuple(v for pose in poses[floats:] for v in pose)
         self.beside = tuple(s for one in self._loose[floats:] for s in one.columns)
-        self.motors = motors(self._path)
-        self.thrusters = () if config.drive else thrusters(model)
+        self.motors, self.served = motors(self._path)
+        self.actuators = () if config.drive else actuators(model)
         natives = Natives(model)
         self.parameters = tuple(natives.parameters)
         self._unconstrained, self._implicit = unconstrained(model), _implicit(model)

@@ -13,14 +13,14 @@ import numpy as np
 import numpy.typing as npt
 
 from gapcert import StateSpec, UsageError
-from gapcert_engines import Motor, Thruster, ball_columns, body_columns
+from gapcert_engines import UNITS, Actuator, Law, Motor, ball_columns, body_columns
 
 if TYPE_CHECKING:
     from .config import MuJoCoConfig
 
 _SCALAR = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 _JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-_PLAIN = (mujoco.mjtTrn.mjTRN_SITE, mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE)
+_PLAIN = (int(mujoco.mjtDyn.mjDYN_NONE), int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_NONE))
 _DISABLE = mujoco.mjtDisableBit
 SCHEMES = {
     mujoco.mjtIntegrator.mjINT_EULER: "semi_implicit",
@@ -87,10 +87,14 @@ def _bare(spec: Any) -> None:
 
 def _spec(path: Path, config: MuJoCoConfig) -> Any:
     """The file with the spec's options, without what cannot move it: sensors, cameras, lights, pictures; and without its
-    actuators but those at sites that inputs name."""
+    actuators but those that inputs name and that are no motors."""
     spec = mujoco.MjSpec.from_file(str(path))
     controls = {target for target in config.inputs.values() if target.endswith(".ctrl")}
-    _strip(spec, [a for a in spec.actuators if not (f"{a.name}.ctrl" in controls and _at_site(a))])
+    for actuator in (nameless := [a for a in spec.actuators if not a.name]):
+        if [a.target for a in nameless].count(actuator.target) == 1:
+            actuator.name = actuator.target
+    lone = {m.name for m in motors(path)[0]} if controls else set()
+    _strip(spec, [a for a in spec.actuators if f"{a.name}.ctrl" not in controls or a.name in lone or not _kept(a)])
     _set_base(spec, path, config.fixed_base)
     _set_options(spec, config)
     for joint in spec.joints:
@@ -113,24 +117,65 @@ def _strip(spec: Any, actuators: Sequence[Any] = ()) -> None:
             spec.delete(element)
 
 
-def _at_site(actuator: Any) -> bool:
-    """Is it a wrench, gear · control, in the frame of a site, without a law or a memory of its own?"""
-    law = (actuator.trntype, actuator.dyntype, actuator.gaintype, actuator.biastype)
-    more = (actuator.delay, actuator.armature, actuator.damping)
-    return law == _PLAIN and not actuator.refsite and not any(np.any(part) for part in more)
+def _kept(actuator: Any) -> bool:
+    """Has it no memory of its own: no activation, no delay?"""
+    return bool(actuator.dyntype == mujoco.mjtDyn.mjDYN_NONE and not np.any(actuator.delay))
 
 
-def thrusters(model: Any) -> tuple[Thruster, ...]:
-    """Of a compiled robot without a drive: motors at sites. Controls are in N where they push, else in N·m."""
-    pushes = model.actuator_gear[:, :3].any(axis=1)
-    return tuple(Thruster(str(model.actuator(k).name), "N" if pushes[k] else "N*m") for k in range(model.nu))
+def actuators(model: Any) -> tuple[Actuator, ...]:
+    """Of a compiled robot without a drive: what it has kept."""
+    return tuple(_actuator(model, k) for k in range(model.nu))
 
 
-def motors(path: Path) -> tuple[Motor, ...]:
-    """Actuators of the file that are a plain effort, alone at a hinge or slide; one without a name has its joint's."""
+def _actuator(model: Any, k: int) -> Actuator:
+    name, kind, law = str(model.actuator(k).name), mujoco.mjtTrn(int(model.actuator_trntype[k])), _law(model, k)
+    if law is not None:
+        slides = model.jnt_type[model.actuator_trnid[k, 0]] == mujoco.mjtJoint.mjJNT_SLIDE
+        position, velocity, _ = UNITS["prismatic" if slides else "revolute"]
+        return Actuator(name, {"position": position, "velocity": velocity, "effort": "1"}[law.commands], law)
+    plain = (int(model.actuator_gaintype[k]), int(model.actuator_biastype[k])) == _PLAIN[1:]
+    if kind == mujoco.mjtTrn.mjTRN_SITE and plain:
+        return Actuator(name, "N" if model.actuator_gear[k, :3].any() else "N*m")
+    return Actuator(name, "1")
+
+
+def _law(model: Any, k: int) -> Law | None:
+    """Of an affine effort at a hinge or slide."""
+    joint = int(model.actuator_trnid[k, 0])
+    gain, bias = mujoco.mjtGain(int(model.actuator_gaintype[k])), mujoco.mjtBias(int(model.actuator_biastype[k]))
+    straight = gain == mujoco.mjtGain.mjGAIN_FIXED and bias in (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
+    more = (model.actuator_armature, model.actuator_damping, model.actuator_dampingpoly)
+    if mujoco.mjtTrn(int(model.actuator_trntype[k])) not in _JOINTS or not straight or any(np.any(part[k]) for part in more):
+        return None
+    if mujoco.mjtJoint(int(model.jnt_type[joint])) not in _SCALAR or model.jnt_actfrclimited[joint]:
+        return None
+    offset, position, velocity = model.actuator_biasprm[k, :3].tolist() if bias == mujoco.mjtBias.mjBIAS_AFFINE else [0.0] * 3
+    limited = not model.opt.disableflags & int(_DISABLE.mjDSBL_CLAMPCTRL)
+    return Law(
+        joint_name(model, joint),
+        float(model.actuator_gear[k, 0]),
+        float(model.actuator_gainprm[k, 0]),
+        offset,
+        position,
+        velocity,
+        _ends(model.actuator_ctrllimited[k] and limited, model.actuator_ctrlrange[k]),
+        _ends(model.actuator_forcelimited[k], model.actuator_forcerange[k]),
+        held=model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    )
+
+
+def _ends(limited: Any, ends: Any) -> tuple[float, float]:
+    return (float(ends[0]), float(ends[1])) if limited else (-math.inf, math.inf)
+
+
+def motors(path: Path) -> tuple[tuple[Motor, ...], dict[str, str]]:
+    """Actuators of the file that are a plain effort, alone at a hinge or slide; and joints that others drive, by whose name.
+
+    One without a name has its joint's.
+    """
     spec = mujoco.MjSpec.from_file(str(path))
     if not list(spec.actuators):
-        return ()
+        return (), {}
     _strip(spec)
     for geom in spec.geoms:
         if geom.meshname:  # What they look like is not asked.
@@ -140,18 +185,21 @@ def motors(path: Path) -> tuple[Motor, ...]:
     try:
         model = spec.compile()
     except ValueError:  # What is wrong with the robot is told where it is compiled without them.
-        return ()
+        return (), {}
     kinds = [mujoco.mjtTrn(int(kind)) for kind in model.actuator_trntype]
     at = [int(j) if kind in _JOINTS else -1 for j, kind in zip(model.actuator_trnid[:, 0], kinds, strict=True)]
     found = [_motor(model, k, j) for k, j in enumerate(at) if j >= 0 and at.count(j) == 1 and _lawless(model, k, j)]
     names = [m.name for m in found]
-    return tuple(m for m in found if names.count(m.name) == 1)
+    alone = tuple(m for m in found if names.count(m.name) == 1)
+    laws = zip(model.actuator_dyntype, model.actuator_gaintype, model.actuator_biastype, strict=True)
+    lawful = {k: joint_name(model, at[k]) for k, own in enumerate(laws) if at[k] >= 0 and tuple(map(int, own)) != _PLAIN}
+    return alone, {joint: str(model.actuator(k).name) or joint for k, joint in lawful.items()}
 
 
 def _lawless(model: Any, k: int, joint: int) -> bool:
     """Is its effort gear · control, without a law or a memory of its own?"""
     law = [int(part[k]) for part in (model.actuator_dyntype, model.actuator_gaintype, model.actuator_biastype)]
-    plain = law == list(map(int, _PLAIN[1:])) and mujoco.mjtJoint(int(model.jnt_type[joint])) in _SCALAR
+    plain = law == list(_PLAIN) and mujoco.mjtJoint(int(model.jnt_type[joint])) in _SCALAR
     more = (model.actuator_delay, model.actuator_armature, model.actuator_damping, model.actuator_dampingpoly)
     single = model.actuator_gainprm[k, 0] == 1 and model.actuator_gear[k, 0] != 0
     return bool(plain and single and not any(np.any(part[k]) for part in more))
@@ -346,7 +394,6 @@ def beyond(model: Any) -> list[str]:
         "deformable bodies": model.nflex,
         "a medium": option.density or option.viscosity or np.any(option.wind),
         "geoms that may touch": touches(model),
-        "motors at sites": model.nu,
         f"integrator {mujoco.mjtIntegrator(int(option.integrator)).name.removeprefix('mjINT_').lower()}": (
             option.integrator not in SCHEMES
         ),

@@ -21,7 +21,7 @@ from .robot import loose
 
 _FORCE = int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 _PUSHED = _FORCE | int(mujoco.mjtState.mjSTATE_CTRL)
-"""Controls of thrusters, then forces at joints."""
+"""Controls of actuators, then forces at joints."""
 _NUMBERS = 2**19
 """Numbers of 8 bytes that one call may write."""
 _ROWS = 256

@@ -93,8 +93,10 @@ class MuJoCoWorld(EngineWorld):
                 part.reshape(len(state), self.copies, -1)[:] = joints[:, :, field].reshape(len(state), self.copies, -1)
             else:
                 part[:, places] = joints[:, :, field]
+        if base is None:
+            return state
         at = 0
-        for one in self._loose if base is not None else ():
+        for one in self._loose:
             q, v, place = 1 + one.q, 1 + nq + one.v, 0 if one.ball else 3
             own = base[:, at : at + place + 4 + place + 3]
             at += own.shape[1]
@@ -112,7 +114,7 @@ class MuJoCoWorld(EngineWorld):
         return state
 
     def _force(self, effort: Array) -> Array:
-        """Controls of the thrusters of all copies, then forces."""
+        """Controls of the actuators of all copies, then forces."""
         n, steps, _ = effort.shape
         nj = len(self._position) // self.copies
         if self.copies > 1:

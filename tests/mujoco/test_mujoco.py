@@ -598,7 +598,12 @@ def test_a_joint_starts_where_the_file_puts_it(tmp_path):
 def test_the_files_actuators_are_left_out(tmp_path):
     more = '<actuator><position joint="hinge" kp="100"/></actuator><keyframe><key ctrl="1"/></keyframe>'
     x, u = query(10)
-    assert np.abs(rod(tmp_path, more=more).step(x, u).x - semi_implicit(x, u)).max() <= 1e-15
+    with pytest.raises(
+        UsageError, match=r"drives joint 'hinge' by its actuator 'hinge'; give its command, hinge\.ctrl, or say"
+    ):
+        rod(tmp_path, more=more)
+    system = rod(tmp_path, more=more, inputs={"torque": "hinge.effort"})
+    assert np.abs(system.step(x, u).x - semi_implicit(x, u)).max() <= 1e-15
 
 
 BALL = '<body><joint name="eye" type="ball"/><geom size="0.1"/></body>'

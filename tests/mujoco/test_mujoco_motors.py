@@ -143,10 +143,13 @@ def test_a_gear_that_stands_in_an_included_file_is_set_by_code(tmp_path):
 )
 def test_what_is_more_than_a_motor_is_none(tmp_path, actuator):
     text = CRANE.replace('<motor joint="rope" gear="-1.5"/>', actuator)
-    model = gapcert_engines.EngineModel(backend(tmp_path, text))
+    model = gapcert_engines.EngineModel(backend(tmp_path, text, {"u": "trolley", "w": "rope.effort"}))
     assert (model.native("input-gain", "u"), model.native("input-gain", "w")) == ("gear.winch", None)
-    with pytest.raises(gc.UsageError, match=r"inputs\.w: .* has no motor 'rope' that is a plain effort .* it has winch"):
-        backend(tmp_path, text, "controls")
+    if "filter" in actuator or actuator.count("<") == 2:
+        with pytest.raises(
+            gc.UsageError, match=r"inputs\.w: .* has no actuator 'rope' without a memory .*; it has winch"
+        ):
+            backend(tmp_path, text, "controls")
 
 
 def test_one_joint_has_one_input(tmp_path):

@@ -122,8 +122,8 @@ def test_an_input_of_another_unit_and_what_is_no_motor_are_refused(tmp_path):
     model = gc.registry().build("model", "equations", gc.registry().config("model", "equations")(**section))
     with pytest.raises(gc.UsageError, match=r"inputs\.a: the model gives it in N\*m, but what drives 'left\.ctrl' is in N;"):
         backend(tmp_path, inputs={"a": "left.ctrl"}, model=model)
-    with pytest.raises(gc.UsageError, match=r"inputs\.a: .* has no motor 'servo' .* or at a place on a body; it has lift"):
-        backend(tmp_path, inputs={"a": "servo.ctrl"})
+    with pytest.raises(gc.UsageError, match=r"inputs\.a: .* has no actuator 'swing' without a memory of its own; it has lift"):
+        backend(tmp_path, inputs={"a": "swing.ctrl"})
     with pytest.raises(gc.UsageError, match="inputs go to motors at sites and to a drive; expected one of the two"):
         backend(tmp_path, inputs={"a": "left.ctrl", "v": "drive"}, drive={"elements": {"x": {"v": 1}}})
 

@@ -175,3 +175,42 @@ def test_copies_hold_neither_shapes_nor_pictures(tmp_path):
         np.testing.assert_array_equal(np.concatenate([getattr(one, part)[1:]] * 8), getattr(many, part)[1:])
     backend = built(section(tmp_path, robot), tmp_path)
     assert backend.tiling.endswith("copies, bit-equal to one robot")
+
+
+SERVOS = {
+    "position": '<position name="s" joint="a" kp="30" kv="2" gear="1.5" forcerange="-4 4" ctrlrange="-1 1"/>',
+    "position without limits": '<position name="s" joint="a" kp="30"/>',
+    "velocity": '<velocity name="s" joint="a" kv="3" forcerange="-2 5"/>',
+    "general": '<general name="s" joint="a" gainprm="7" biastype="affine" biasprm="0.3 -2 -0.4" gear="-2" ctrlrange="-0.5 2"/>',
+    "general, an effort": '<general name="s" joint="a" gainprm="7" forcerange="-1 1"/>',
+}
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+@pytest.mark.parametrize("case", SERVOS)
+def test_a_servo_of_the_file_follows_its_command(tmp_path, case, integrator):
+    """By equations, and in the engine; also where its effort is cut, which frees its damping from the step."""
+    robot = text(option=f'integrator="{integrator}"', end=f"<actuator>{SERVOS[case]}</actuator>")
+    (tmp_path / "robot.xml").write_text(robot)
+    of = section(tmp_path, robot) | {"inputs": {"u": "s.ctrl"}}
+    (tmp_path / "robot.yaml").write_text(json.dumps({"version": 1, "name": "r", "model": {"kind": "engine", "of": of}}))
+    made = gc.load_spec(tmp_path / "robot.yaml").build("model")
+    assert isinstance(made, EngineModel)
+    assert made.inputs[0].unit == {"p": "rad", "v": "rad/s", "g": "1"}[case[0]]
+    raw, rng = mujoco.MjModel.from_xml_string(robot), np.random.default_rng(3)
+    order, cut = [s.name for s in made.states], set[bool]()
+    for u in np.linspace(-2.5, 2.5, 21):
+        data = mujoco.MjData(raw)
+        data.qpos[:], data.qvel[:], data.ctrl[0] = rng.uniform(-1, 1, 2), rng.normal(size=2), u
+        known = {"a": data.qpos[0], "b": data.qpos[1], "a_dot": data.qvel[0], "b_dot": data.qvel[1]}
+        x = np.array([[known[n] for n in order]])
+        mujoco.mj_step(raw, data, 2)
+        cut.add(abs(data.actuator_force[0]) >= 1)
+        after = {"a": data.qpos[0], "b": data.qpos[1], "a_dot": data.qvel[0], "b_dot": data.qvel[1]}
+        expected = [after[n] for n in order]
+        np.testing.assert_allclose(made.step(x, [[u]]).x[0], expected, rtol=0, atol=1e-10)
+        backwards = [[s.name for s in made.backend.states].index(n) for n in order]
+        at = np.empty_like(x)
+        at[:, backwards] = x
+        np.testing.assert_allclose(made.backend.step(at, [[u]]).x[0, backwards], expected, rtol=0, atol=1e-12)
+    assert cut == ({True} if "without" in case else {False, True})
