@@ -13,6 +13,8 @@ from gapcert.plugin import magnitude
 Coefficient = Annotated[FiniteFloat, Field(ge=0)]
 FEEDBACK = ("yaw", "yaw_rate")
 """What a drive may feed back besides the inputs: heading and turning rate of the base."""
+_LOOSE = ("rotation", *(f"{kind}{axis}" for kind in ("", "v", "w") for axis in "xyz"))
+"""Fields of what is no joint of one number."""
 
 
 @final
@@ -98,7 +100,8 @@ class EngineConfig(BaseModel, ABC):
     @classmethod
     def _fields(cls, states: dict[str, str]) -> dict[str, str]:
         for name, target in states.items():
-            if not target.rpartition(".")[0]:
+            owner, _, field = target.rpartition(".")
+            if not owner or (owner != "base" and field not in ("position", "velocity", *_LOOSE)):
                 raise ValueError(f"state '{name}' is '{target}'; expected JOINT.position, JOINT.velocity or base.FIELD")
         return _distinct(states)
 

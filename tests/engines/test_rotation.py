@@ -7,7 +7,7 @@ import pytest
 
 from gapcert_engines.wiring import from_columns, to_columns
 
-EULER = SimpleNamespace(rotation="euler")
+EULER = SimpleNamespace(rotation="euler", fixed_base=False)
 
 
 def angles(n):
