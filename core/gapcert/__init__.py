@@ -59,7 +59,7 @@ _MOVED = homes(
             "write_saved"
         ),
         "gapcert_engines": (
-            "Drive Engine EngineBackend EngineConfig EngineModel EngineWorld Joint Link Motor RobotText Thruster as_section "
+            "Drive Engine EngineBackend EngineConfig EngineModel EngineWorld Joint Link Motor RobotText as_section "
             "file_shapes muted patched_sdf patched_urdf"
         ),
         "gapcert_figures": (
