@@ -409,7 +409,9 @@ def places(kind: str, p: Plant, view: Sequence[str]) -> tuple[str, ...]:
 def doubtful(part: str, seed: int, index: int) -> Case:
     """One effect, kinds in turn, in a short noisy log of a single poor input, where several may look alike."""
     rng, kind, case = generator(part, seed, index), ALIKE[index % len(ALIKE)], None
-    for _ in range(20):
+    for k in range(1000):
+        if k >= 20 and case is not None:
+            break
         p = plant(str(rng.choice(NAMES)), rng)
         r = rig(p, str(rng.choice(POOR)), rng)
         if not (sites := places(kind, p, r.view)) or "runs" in r.excitation:
