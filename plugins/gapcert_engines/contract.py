@@ -327,7 +327,7 @@ class Engine(ABC):
     ) -> dict[str, Any]:
         """The robot as part of an equations model's section: parameters, bodies, gravity, forces without inputs, integrator.
 
-        It stands for a robot of which nothing goes `beyond` it. coordinates: of the movable joints; free: native parameters →
+        It is exact where `beyond` is empty. coordinates: of the movable joints; free: native parameters →
         names of parameters that stand for their numbers; values: those of native parameters that are not the file's.
         """
         named = dict(zip((j.name for j in self.joints if j.movable), coordinates, strict=True))

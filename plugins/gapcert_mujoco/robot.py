@@ -44,6 +44,8 @@ def compiled(path: Path, config: MuJoCoConfig, copies: int = 1) -> Any:
         path.read_text(encoding="utf-8")
     except UnicodeDecodeError:  # MuJoCo takes it, and its names are none
         raise UsageError(f"backend.robot: {path} is not UTF-8 text; expected an MJCF or URDF file") from None
+    # MuJoCo keeps meshes by name and time in seconds: one that is edited within a second would be missed.
+    mujoco.mj_clearCache(mujoco.mj_getCache())
     try:
         return _compiled(path, config, copies, 0.0)
     except ValueError as error:
@@ -54,7 +56,6 @@ def compiled(path: Path, config: MuJoCoConfig, copies: int = 1) -> Any:
             said = " ".join(str(error).split())
             raise UsageError(f"backend.robot: MuJoCo cannot load {path}: {said}; expected a valid MJCF or URDF file") from None
     finally:
-        # MuJoCo keeps meshes by name and time in seconds: one that is edited within a second would be missed.
         mujoco.mj_clearCache(mujoco.mj_getCache())
 
 
@@ -80,7 +81,8 @@ def _bare(spec: Any) -> None:
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
     spec.compiler.settotalmass, spec.compiler.balanceinertia = -1, False
     idle = [g for g in spec.geoms if not g.fluid_ellipsoid and g.id not in wrapped]
-    for elements in (spec.pairs, spec.excludes, idle, spec.meshes, spec.hfields):
+    shapes = {g.meshname for g in spec.geoms if g.fluid_ellipsoid}
+    for elements in (spec.pairs, spec.excludes, idle, [m for m in spec.meshes if m.name not in shapes], spec.hfields):
         for element in list(elements):
             spec.delete(element)
 
@@ -369,7 +371,7 @@ def loose(model: Any, *, fixed_base: bool) -> list[Loose]:
         carries = np.count_nonzero(model.body_rootid[model.jnt_bodyid] == model.body_rootid[body]) > 1
         one = Loose(name, ball, int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j]))
         found.append((fixed_base or ball or not carries, ball, one))
-    return [one for *_, one in sorted(found, key=lambda f: f[:2])] if not fixed_base else [one for *_, one in found]
+    return [one for *_, one in sorted(found, key=lambda f: f[:2])]
 
 
 def unconstrained(model: Any) -> bool:
@@ -387,7 +389,6 @@ def beyond(model: Any) -> list[str]:
     held = (model.tendon_stiffness, model.tendon_damping, model.tendon_frictionloss, model.tendon_limited)
     tendons = [*held, model.tendon_stiffnesspoly, model.tendon_dampingpoly, model.tendon_armature]
     found = {
-        "joints that are balls or free": not scalar(model).all(),
         "springs or dampers that bend": np.any(model.jnt_stiffnesspoly) or np.any(model.dof_dampingpoly),
         f"tendon {_first(model.tendon, tendons)}": any(map(np.any, tendons)),
         f"equality {_first(model.equality, [model.eq_active0])}": model.eq_active0.any(),
