@@ -152,12 +152,12 @@ def test_engines_that_agree_are_not_diagnosed(meet, tmp_path):
 
 TIED = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="hinge" axis="0 -1 0"/>
   <inertial pos="0 0 -0.5" mass="1" diaginertia="0.0833333333333 0.0833333333333 0.001"/></body></worldbody>
-  <tendon><fixed><joint joint="hinge" coef="1"/></fixed></tendon></mujoco>"""
+  <tendon><fixed limited="true" range="-50 50"><joint joint="hinge" coef="1"/></fixed></tendon></mujoco>"""
 
 
 @pytest.mark.exam
 def test_what_cannot_be_diagnosed_is_searched_setting_by_setting(meet, tmp_path):
-    """A tendon, if only a slack one, is no law of a tree of bodies."""
+    """A tendon, if only one that never tightens, is no law of a tree of bodies."""
     path = tmp_path / "tied.xml"
     path.write_text(TIED)
     summary, _ = meet(MODEL, engine("mujoco", robot=str(path), substeps=5))

@@ -146,9 +146,7 @@ def test_what_is_more_than_a_motor_is_none(tmp_path, actuator):
     model = gapcert_engines.EngineModel(backend(tmp_path, text, {"u": "trolley", "w": "rope.effort"}))
     assert (model.native("input-gain", "u"), model.native("input-gain", "w")) == ("gear.winch", None)
     if "filter" in actuator or actuator.count("<") == 2:
-        with pytest.raises(
-            gc.UsageError, match=r"inputs\.w: .* has no actuator 'rope' without a memory .*; it has winch"
-        ):
+        with pytest.raises(gc.UsageError, match=r"inputs\.w: .* has no actuator 'rope' without a memory .*; it has winch"):
             backend(tmp_path, text, "controls")
 
 

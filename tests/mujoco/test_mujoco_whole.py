@@ -2,7 +2,6 @@
 
 import json
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -72,6 +71,8 @@ def model(folder, robot, **more):
 
 def stepped(robot, q, v, torque, steps=2):
     """MuJoCo alone."""
+    import mujoco
+
     raw = mujoco.MjModel.from_xml_string(robot)
     data = mujoco.MjData(raw)
     data.qpos[:], data.qvel[:] = q, v
@@ -114,6 +115,8 @@ BALL = """<body name="lamp" pos="-0.4 0 1"><joint name="eye" type="ball" damping
 
 
 def test_a_body_that_lies_about_and_a_ball_move_as_in_the_engine(tmp_path):
+    import mujoco
+
     floor = '<geom type="plane" size="1 1 1" contype="1" conaffinity="1"/>'
     robot = text(floor=floor, more=FREE.format(cube='contype="1" conaffinity="1"') + BALL)
     beside = {f"cube_{f}": f"cube.{f}" for f in ("x", "y", "z", "vx", "vy", "vz", "wx", "wy", "wz")}
@@ -190,6 +193,8 @@ SERVOS = {
 @pytest.mark.parametrize("case", SERVOS)
 def test_a_servo_of_the_file_follows_its_command(tmp_path, case, integrator):
     """By equations, and in the engine; also where its effort is cut, which frees its damping from the step."""
+    import mujoco
+
     robot = text(option=f'integrator="{integrator}"', end=f"<actuator>{SERVOS[case]}</actuator>")
     (tmp_path / "robot.xml").write_text(robot)
     of = section(tmp_path, robot) | {"inputs": {"u": "s.ctrl"}}
