@@ -272,7 +272,7 @@ class Judge:
         freed = {list(r.plant.values).index(h.site) for h in effects if h.effect == "parameter"}
         loose = [j for j in loose if j not in freed]
         scale = np.maximum(np.std(self.x, axis=0), 1e-9)
-        sizes = np.array([max(abs(effects[i].numbers[n]), 1e-9) for i, n in keys])
+        sizes = np.array([v if abs(v) > 1e-9 else 1e-9 for v in (effects[i].numbers[n] for i, n in keys)])
         owner = np.searchsorted(self.at, self.rows, side="right") - 1
         weight = 1 / (r.tolerance * np.abs(r.stated[loose]))
 

@@ -263,7 +263,7 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
     design, separable, besides = spared("experiment", (None, (), {}), told_apart, *told)
     lap("experiment")
     whole_model = data.library.extended(answer.causes, answer.fit.values)
-    left = spared("test of what is left", None, leftover.left, whole_model, answer.fit, seed)
+    left = spared("test of what is left", None, leftover.left, whole_model, answer.fit, judge.horizon, seed)
     doubted = doubt(answer.fit)
     undecided = design is not None or bool(answer.ties and spared.told)
     odd = bool(doubted and not named) or any(f.startswith("implausible") for c in named for f in c.flags)
@@ -277,7 +277,7 @@ def _searched(problem: DiagnosisProblem) -> Diagnosis:
     verdict: Verdict = "unexplained"
     if left is not None:
         verdict = leftover.verdict(len(named), left, answer.fit, answer.nothing, undecided, odd, near, stays)
-        named = tuple(replace(c, flags=(*c.flags, *leftover.doubts(laws, left, len(settings)))) for c in named)
+        named = tuple(replace(c, flags=(*c.flags, *leftover.doubts(laws, left, answer.fit, len(settings)))) for c in named)
     if pushed and verdict == "nothing":
         verdict = "unexplained"
     lap("leftover")
@@ -578,7 +578,9 @@ def _length(measured: Dataset, model: Model, window: float | None, wanted: float
     usual = measured.samples(wanted or (THRESHOLDS.window if len(model.coordinates) < 2 else THRESHOLDS.coupled_window))
     if window is None:
         count = THRESHOLDS.guard_windows if wanted else THRESHOLDS.usual_windows
-        return max(THRESHOLDS.usual_samples, min(usual, sum(lengths) // count, most))
+        length = max(THRESHOLDS.usual_samples, min(usual, sum(lengths) // count, most))
+        # Runs are cut into windows without a rest: no fewer of them, and all of a run counts.
+        return max(THRESHOLDS.usual_samples, most // max(1, round(most / length))) if len(lengths) > 1 else length
     if (own := measured.samples(window)) < THRESHOLDS.window_samples:
         raise UsageError(
             f"diagnose.window: {window:g} s hold {own} samples, {measured.period:g} s apart; expected "

@@ -182,6 +182,8 @@ class Thresholds:
     same_score: float = chosen(1e-9, "nats: scores of one and the same motion differ by rounding alone")
     first_radius: float = chosen(0.25, "of a fit, in a candidate's coordinate")
     # residual
+    wide_window: float = chosen(2.0, "times the longest horizon: what is slow adds up in windows so long")
+    astray_sigmas: float = chosen(3.0, "by which parameters together are off: by chance, in one of 700 logs")
     lack_sigmas: float = chosen(5.0, "of the largest of some hundred scores: by chance, one in ten thousand logs has one")
     new_direction: float = chosen(0.02, "share of a force that starts and fitted numbers must leave for one of its own")
     joint_direction: float = chosen(1e-2, "of the largest singular value: smaller ones are nearly others of the kind")

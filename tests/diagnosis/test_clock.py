@@ -5,7 +5,7 @@ import pytest
 
 from gapcert import Recording, UsageError, diagnose
 from gapcert_diagnosis.data.dataset import Dataset
-from gapcert_diagnosis.residual.unexplained import Left, doubts
+from gapcert_diagnosis.residual.unexplained import Left
 from gapcert_diagnosis.testing import ROD, equations
 
 FEW = ["viscous-friction", "constant-force"]
@@ -65,10 +65,9 @@ def test_a_velocity_that_is_wrong_otherwise_is_no_matter_of_time(wrong):
 
 def test_a_share_of_no_effort_is_no_percentage():
     left = Left.__new__(Left)
-    for name, value in {"growth": _Grown, "learnt": (), "lack": None, "share": 1e152}.items():
+    for name, value in {"growth": _Grown, "learnt": (), "share": 1e152}.items():
         object.__setattr__(left, name, value)
-    (said,) = doubts(1, left)
-    assert said == "inadequate: a residual of more than any effort here is left that is not noise"
+    assert left.doubt == "inadequate: a residual of more than any effort here is left that is not noise"
 
 
 class _Grown:

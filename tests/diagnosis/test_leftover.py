@@ -168,11 +168,12 @@ def test_a_window_on_the_wrong_side_of_a_summit_is_led_back():
 
 def test_causes_that_leave_something_are_doubted():
     found, last = left(recorded(truth("quadratic")))
-    (doubt,) = leftover.doubts(1, found)
+    (doubt,) = leftover.doubts(1, found, last)
     assert doubt.startswith("inadequate: a residual of ")
     assert doubt.endswith("it looks like a law of the present state and input")
-    assert leftover.doubts(3, found)[1].startswith("composite: 3 causes")
-    assert len(leftover.doubts(3, found, settings=1)) == 1
+    assert leftover.doubts(3, found, last)[1].startswith("composite: 3 causes")
+    assert len(leftover.doubts(3, found, last, settings=1)) == 1
+    assert leftover.doubts(0, found, last) == ()
     nothing = replace(last, residual=5 * last.residual)
     for causes, before, undecided, doubted, close, verdict in (
         (0, last, False, False, True, "unexplained"),
@@ -211,8 +212,40 @@ def test_a_direction_shows_what_is_too_little_for_other_tests(colour):
         assert (lacking is not None) == seen
     assert lacking.site == "q"
     assert lacking.sigmas > 5
-    (doubt,) = leftover.doubts(1, replace(found, growth=replace(found.growth, sigmas=0.0), learnt=(), lack=lacking))
+    doubt = replace(found, growth=replace(found.growth, sigmas=0.0), learnt=(), lack=lacking).doubt
     assert doubt.startswith("inadequate: what is left goes with ")
+
+
+@pytest.mark.parametrize("sag", [0.0, 0.2])
+def test_what_is_slow_shows_in_windows_beyond_the_horizon(sag):
+    """A gain that stands for a supply that sags within a second leaves noise in windows of 0.3 s."""
+    load = Memory("load", "N*m", "abs({u}) + (load - abs({u}))*exp(-{h}/lag)")
+    numbers = (Parameter("lag", 1.0, "s"), Parameter("sag", sag, "1/(N*m)"))
+    system = truth().extend([Extension("hidden", "u", numbers, input="{u}*(1 - sag*load)", memory=(load,))])
+    model = equations(SWING)
+    library = Library(model, Dataset.of(model, recorded(system, noise=5e-3)), [gc.registry().build("effect", "input-gain")])
+    last = fit(library.hypothesis(library.candidates), library.measured.windows(30))
+    extended = library.extended(library.candidates, last.values)
+    assert leftover.left(extended, last).doubt is None
+    found = leftover.left(extended, last, horizon=1.2)
+    assert found.wide.long.windows.length == 240
+    assert not found.coherent
+    assert found.doubt == found.wide.doubt
+    assert (found.doubt is not None) == (sag > 0)
+
+
+def test_parameters_that_a_stand_in_drags_along_doubt_it():
+    """What is stated is a measurement, too: a cause beside which all parameters have to move is less likely than they are."""
+    parameters = ROD["parameters"] | {n: {"value": f"1 {u}", "tolerance": "1 %"} for n, u in (("m", "kg"), ("l", "m"))}
+    model = equations({**ROD, "parameters": parameters})
+    recording = recorded(equations({**ROD, "period": "2 ms", "parameters": ROD["parameters"] | {"m": "1.06 kg"}}))
+    library = Library(model, Dataset.of(model, recording), [gc.registry().build("effect", "parameter")])
+    doubts = {}
+    for c in library.candidates:
+        last = fit(library.hypothesis((c,)), library.measured.windows(120))
+        doubts[c.site] = leftover.doubts(1, leftover.left(library.extended((c,), last.values), last), last)
+    assert doubts["m"] == ()
+    assert doubts["l"][-1].startswith("inadequate: parameters that are no cause have to be further")
 
 
 def test_what_no_single_force_is_like_shows_in_a_kind(monkeypatch):

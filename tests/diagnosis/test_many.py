@@ -9,9 +9,10 @@ import pytest
 from exams.hide import hide
 
 import gapcert as gc
+from gapcert.plugin import Recording, Trajectory
 from gapcert.testing import multisine
 from gapcert_diagnosis.data.dataset import Dataset
-from gapcert_diagnosis.diagnose import _largest_first
+from gapcert_diagnosis.diagnose import _largest_first, _length
 from gapcert_diagnosis.fitting import fit as fitting
 from gapcert_diagnosis.fitting.rollout_error import Stretches, stretches
 from gapcert_diagnosis.search import fitted_sets, moves
@@ -25,7 +26,7 @@ from gapcert_diagnosis.search.gains import GainTable
 from gapcert_diagnosis.search.moves import additions, idle, replacements
 from gapcert_diagnosis.search.screening import Screen, _distinct, standing_in
 from gapcert_diagnosis.search.stepwise import EquationSearch, lightest
-from gapcert_diagnosis.testing import equations
+from gapcert_diagnosis.testing import ROD, equations
 
 TWO = {
     "kind": "equations",
@@ -414,3 +415,17 @@ def test_the_fit_of_nothing_is_made_once(monkeypatch):
     assert not made
     np.testing.assert_array_equal(given.residual, FittedSets(library, windows).nothing.residual)
     assert len(made) == 1
+
+
+@pytest.mark.parametrize(("samples", "length"), [(160, 150), (189, 179), (200, 95), (330, 106), (1210, 120)])
+def test_runs_are_cut_into_windows_without_a_rest(samples, length):
+    """Windows of a second side by side would leave up to half of a run to nobody: here it has few samples, or some parts."""
+    model, rng = equations(ROD), np.random.default_rng(0)
+    t = np.arange(samples) * model.period
+    runs = [Trajectory(t, {"q": rng.standard_normal(samples), "u": rng.standard_normal(samples)}, f"{i}") for i in range(12)]
+    measured = Dataset.of(model, Recording(tuple(runs), {}, "zero"))
+    room = samples - measured.history
+    assert _length(measured, model, None) == length
+    assert _length(measured, model, 1.0) == 100
+    assert measured.windows(length).y.shape[:2] == (12 * round(room / 120), length)
+    assert room - round(room / 120) * length < 3

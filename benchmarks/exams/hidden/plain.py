@@ -20,7 +20,7 @@ from gapcert.numerics.kernels import compiler
 compiled = compiler(error_model="numpy")
 
 VISCOUS, QUADRATIC, DRY, CONSTANT, PUSH, WHEN, LONG = range(7)
-GAIN, OFFSET, MINUS, PLUS, HARD, SOFT, DELAY, LAG, RATE, SAG, SAG_TIME = range(11)
+GAIN, OFFSET, MINUS, PLUS, HARD, SOFT, DELAY, LAG, RATE, SAG, SAG_TIME, SECOND, SQUARE, CUBE, RATIO, SHARPNESS = range(16)
 SCALE, BIAS, LATE, SLOW = range(4)
 WINDOW, RUN = 1, 2  # what begins at a sample: a rollout, or a run with all its memories
 STEPS = 12  # in the fastest time constant, and in a sample, at least
@@ -81,7 +81,8 @@ def slope(number: int, p: Array, F: Array, x: Array, a: float, t: float, h: floa
 @compiled
 def path(W: Array, memory: Array, a: float, h: float) -> float:
     """What acts, on average over a step, of what was commanded."""
-    a -= min(max(a, -W[MINUS]), W[PLUS])
+    a = max(a - W[PLUS], 0.0) + W[RATIO] * min(a + W[MINUS], 0.0)
+    a += W[SQUARE] * a**2 + W[CUBE] * a**3
     if W[RATE] > 0:
         moved = min(max(a - memory[0], -W[RATE] * h), W[RATE] * h)
         a = memory[0] + 0.5 * moved
@@ -89,11 +90,16 @@ def path(W: Array, memory: Array, a: float, h: float) -> float:
     if W[LAG] > 0:
         now = a + (memory[1] - a) * math.exp(-h / W[LAG])
         a, memory[1] = 0.5 * (memory[1] + now), now
+    if W[SECOND] > 0:
+        now = a + (memory[3] - a) * math.exp(-h / W[SECOND])
+        a, memory[3] = 0.5 * (memory[3] + now), now
     if W[SAG] > 0:
         now = abs(a) + (memory[2] - abs(a)) * math.exp(-h / W[SAG_TIME])
         a, memory[2] = a * (1 - 0.5 * W[SAG] * (memory[2] + now)), now
     a = W[GAIN] * a + W[OFFSET]
-    if W[HARD] > 0:
+    if W[HARD] > 0 and W[SHARPNESS] > 0:
+        a /= (1 + abs(a / W[HARD]) ** W[SHARPNESS]) ** (1 / W[SHARPNESS])
+    elif W[HARD] > 0:
         a = min(max(a, -W[HARD]), W[HARD])
     if W[SOFT] > 0:
         a = W[SOFT] * math.tanh(a / W[SOFT])
@@ -137,8 +143,8 @@ def simulate(
     n, count, h = starts.shape[1], len(u), period / sub
     ny = len(S)
     X, Y, fine = np.zeros((count, n)), np.zeros((count, ny)), np.zeros((count * sub, ny))
-    x, z, d, kept = np.zeros(n), np.zeros(n), np.zeros((4, n)), np.zeros(3)
-    memory, first, begun, total, last = np.zeros(3), 0, 0, 0.0, 0.0
+    x, z, d, kept = np.zeros(n), np.zeros(n), np.zeros((4, n)), np.zeros(4)
+    memory, first, begun, total, last = np.zeros(4), 0, 0, 0.0, 0.0
     here, there = np.zeros(ny), np.zeros(ny)
     for k in range(count):
         if begins[k] > 0:
@@ -523,11 +529,12 @@ _FORCES = {
 _INPUTS = {
     "input-gain": {"gain": GAIN},
     "input-offset": {"offset": OFFSET},
-    "input-dead-zone": {"minus": MINUS, "plus": PLUS},
-    "input-saturation": {"level": HARD},
+    "input-dead-zone": {"minus": MINUS, "plus": PLUS, "ratio": RATIO},
+    "input-nonlinearity": {"square": SQUARE, "cube": CUBE},
+    "input-saturation": {"level": HARD, "sharpness": SHARPNESS},
     "input-saturation-soft": {"level": SOFT},
     "input-delay": {"delay": DELAY},
-    "input-lag": {"time_constant": LAG},
+    "input-lag": {"time_constant": LAG, "second": SECOND},
     "input-rate-limit": {"rate": RATE},
     "supply-sag": {"sag": SAG, "time_constant": SAG_TIME},
 }
@@ -540,9 +547,11 @@ _OUTPUTS = {
 
 
 def tables(plant: Plant, p: Array, effects: Sequence[Hidden]) -> tuple[Array, Array, Array, Array]:
-    """(parameters, forces, input path, outputs) with the effects in them; KeyError where one is not known here."""
-    p, F, W, S = p.copy(), np.zeros((len(plant.states), 7)), np.zeros(11), np.zeros((len(plant.shown), 4))
-    W[GAIN] = S[:, SCALE] = 1.0
+    """(parameters, forces, input path, outputs) with the effects in them; KeyError where one is not known or has no place."""
+    if len({h.key for h in effects}) < len(effects):
+        raise KeyError("two laws of one effect")
+    p, F, W, S = p.copy(), np.zeros((len(plant.states), 7)), np.zeros(16), np.zeros((len(plant.shown), 4))
+    W[GAIN] = W[RATIO] = S[:, SCALE] = 1.0
     for h in effects:
         numbers = {"minus": h.numbers["width"], "plus": h.numbers["width"]} if "width" in h.numbers else dict(h.numbers)
         name = h.effect + ("-soft" if numbers.pop("soft", 0.0) else "")

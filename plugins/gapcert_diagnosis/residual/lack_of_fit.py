@@ -169,17 +169,17 @@ def _together(columns: _Columns, least: float, scores: Callable[[], Sequence[Arr
     """
     basis = _spanning(columns.square)
     total = float(np.sum((columns.along @ basis) ** 2))
-    sigmas = _rare(total, basis.shape[1]) if basis.shape[1] else 0.0
+    sigmas = rare(total, basis.shape[1]) if basis.shape[1] else 0.0
     if sigmas < least:
         return 0.0
     for drawn in scores():
         sums = np.sum((drawn @ basis) ** 2, axis=1)
         mean, variance = float(sums.mean()), float(sums.var())
-        sigmas = min(sigmas, _rare(2 * mean * total / variance, 2 * mean**2 / variance))
+        sigmas = min(sigmas, rare(2 * mean * total / variance, 2 * mean**2 / variance))
     return sigmas
 
 
-def _rare(total: float, k: float) -> float:
+def rare(total: float, k: float) -> float:
     """The standard score as rare as χ²(k) ≥ total."""
     return float(-ndtri(max(float(chdtrc(k, total)), 1e-300)))
 

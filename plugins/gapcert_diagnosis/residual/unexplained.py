@@ -24,7 +24,7 @@ from gapcert_diagnosis.results import Push, Unexplained, Verdict
 from gapcert_diagnosis.thresholds import THRESHOLDS
 from gapcert_figures import KINDS
 
-from .lack_of_fit import Lack, lack
+from .lack_of_fit import Lack, lack, rare
 from .regression import Learnt, correction, learn, learn_shown
 from .whiteness import Growth, growth
 
@@ -36,7 +36,8 @@ class Left:
 
     learnt: per coordinate; share: of the effort, the force that would leave as much; lack: what it goes with, though it may be
     too little for the other tests, where something was fitted; shown: learnt per channel above its noise, of what its output
-    equation may lack.
+    equation may lack; wide: the same in windows beyond the longest horizon, where what is slow adds up, if the first say
+    nothing against what was fitted.
     """
 
     long: Tangent
@@ -46,6 +47,7 @@ class Left:
     share: float
     lack: Lack | None = None
     shown: tuple[Learnt, ...] = ()
+    wide: Left | None = None
 
     @property
     def best(self) -> Learnt | None:
@@ -69,18 +71,51 @@ class Left:
         """And more than an integrator leaves?"""
         return self.coherent and self.share > THRESHOLDS.slight_force
 
+    @property
+    def doubt(self) -> str | None:
+        """Why what was fitted may be a stand-in, in words."""
+        if self.coherent and self.share > THRESHOLDS.faint_force:
+            best = self.best
+            kind = max(best.kinds, key=lambda k: best.kinds[k]) if best and best.share > THRESHOLDS.learnt_share else None
+            looks = f"; it looks like {KINDS.get(kind, kind)}" if kind else ""
+            size = (
+                f"{100 * self.share:.2g} % of the effort" if self.share < THRESHOLDS.no_effort else "more than any effort here"
+            )
+            return f"inadequate: a residual of {size} is left that is not noise{looks}"
+        if self.lack is not None:
+            return f"inadequate: what is left goes with {self.lack.kind} ({self.lack.sigmas:.2g} standard deviations of noise)"
+        return None if self.wide is None else self.wide.doubt
 
-def left(model: Model, last: Fit, seed: int = 0) -> Left:
-    """What the final fit leaves; model: with the causes at their fitted numbers, for slopes and for the force of the effort."""
+
+def left(model: Model, last: Fit, horizon: float = 0.0, seed: int = 0) -> Left:
+    """What the final fit leaves; model: with the causes at their fitted numbers, for slopes and for the force of the effort.
+
+    horizon: the longest in s over which the answer is to hold.
+    """
     last, m = rescued(last), last.windows.measured
-    brief = m.windows(min(m.brief(THRESHOLDS.short_window), last.windows.length))
-    again = rescued(fit(last.hypothesis, brief, theta=last.theta, iterations=5))
-    long, short = Tangent.of(model, last), Tangent.of(model, again)
+    long, short = _tangents(model, last)
     found = _judged(long, short, seed)
     if found.remains and m.rough.any():
         smooth = _judged(_smoothed(long), _smoothed(short), seed)
         found = found if smooth.remains else smooth
-    return found
+    if not last.hypothesis.charged or found.doubt is not None:
+        return found
+    rooms = [len(y) - m.first(i) for i, y in enumerate(m.outputs)]
+    length = round(THRESHOLDS.wide_window * max(m.samples(horizon), last.windows.length))
+    length = min(length, max(rooms), sum(rooms) // THRESHOLDS.guard_windows)
+    if length < THRESHOLDS.longer_window * last.windows.length:
+        return found
+    windows = m.windows(length).thinned(THRESHOLDS.fitted_values, THRESHOLDS.guard_windows)
+    wide = rescued(fit(last.hypothesis, windows, theta=last.theta))
+    return replace(found, wide=_judged(*_tangents(model, wide), seed))
+
+
+def _tangents(model: Model, last: Fit) -> tuple[Tangent, Tangent]:
+    """About a fit in its windows, and about the same in short ones."""
+    m = last.windows.measured
+    brief = m.windows(min(m.brief(THRESHOLDS.short_window), last.windows.length))
+    again = rescued(fit(last.hypothesis, brief, theta=last.theta, iterations=5))
+    return Tangent.of(model, last), Tangent.of(model, again)
 
 
 def _judged(long: Tangent, short: Tangent, seed: int) -> Left:
@@ -174,22 +209,30 @@ def verdict(
     return "ambiguous" if undecided else "causes"
 
 
-def doubts(causes: int, found: Left, settings: int = 0) -> tuple[str, ...]:
+def doubts(causes: int, found: Left, last: Fit, settings: int = 0) -> tuple[str, ...]:
     """Why named causes may be stand-ins, as sentences; settings of an engine, among them, are no part of a composite."""
-    out = []
-    if causes and found.coherent and found.share > THRESHOLDS.faint_force:
-        best = found.best
-        kind = max(best.kinds, key=lambda k: best.kinds[k]) if best and best.share > THRESHOLDS.learnt_share else None
-        looks = f"; it looks like {KINDS.get(kind, kind)}" if kind else ""
-        size = f"{100 * found.share:.2g} % of the effort" if found.share < THRESHOLDS.no_effort else "more than any effort here"
-        out.append(f"inadequate: a residual of {size} is left that is not noise{looks}")
-    elif causes and found.lack is not None:
+    out = [found.doubt] if causes and found.doubt is not None else []
+    if causes and (far := _astray(last)) > THRESHOLDS.astray_sigmas:
         out.append(
-            f"inadequate: what is left goes with {found.lack.kind} ({found.lack.sigmas:.2g} standard deviations of noise)"
+            "inadequate: parameters that are no cause have to be further from what is stated than it is trusted "
+            f"({far:.2g} standard deviations)"
         )
     if causes - settings >= THRESHOLDS.several_causes:
         out.append(f"composite: {causes - settings} causes together are often stand-ins for one law that the library lacks")
     return tuple(out)
+
+
+def _astray(last: Fit) -> float:
+    """How rare it is that parameters that are no cause lie so far from what is stated, as standard deviations of one number.
+
+    d = θ − θ₀ has the covariance of the prior, and where noise is coloured, what that adds to the uncertainty of white noise.
+    """
+    h = last.hypothesis
+    rows = np.isfinite(h.sd)
+    more = max(1.0, float(last.chi.mean())) / float(last.whiteness.min()) - 1
+    spread = np.diag(h.sd[rows] ** 2) + more * last.covariance[np.ix_(rows, rows)]
+    d = (last.theta - h.value)[rows]
+    return rare(float(d @ np.linalg.solve(spread, d)), len(d)) if rows.any() else 0.0
 
 
 def unexplained(found: Left, events: tuple[Push, ...] = ()) -> Unexplained:
