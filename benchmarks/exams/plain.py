@@ -257,16 +257,21 @@ class Judge:
         self.rows, self.at = np.arange(count), np.flatnonzero(self.begins)
         self.thin = max(1, len(self.rows) // 3000)
 
-    def misfit(self, effects: Sequence[Hidden], p: Array, starts: Array) -> Array:
-        y = self.rig.replay(effects, p, self.u, self.begins, starts)
+    def misfit(self, effects: Sequence[Hidden], p: Array, starts: Array, before: Array | None = None) -> Array:
+        y = self.rig.replay(effects, p, self.u, self.begins, starts, before)
         return np.asarray((y - self.y)[:, self.rig.columns] / self.sigma)
 
     def strength(self) -> float:
         return _largest(self.misfit((), self.rig.true, self.x[self.at]))
 
-    def fit(self, effects: Sequence[Hidden] = (), steps: int = 8) -> tuple[float, float, float]:
-        """(cost, what parameters pay of it, largest RMS) once numbers, parameters and starts have been refitted."""
+    def fit(self, effects: Sequence[Hidden] = (), steps: int = 8, past: bool = False) -> tuple[float, float, float]:
+        """(cost, what parameters pay of it, largest RMS) once numbers, parameters and starts have been refitted.
+
+        past: and what was commanded before each run, which no log tells.
+        """
         r, nx = self.rig, self.x.shape[1]
+        runs = np.flatnonzero(self.begins == RUN) if past else np.empty(0, dtype=int)
+        within, size = np.searchsorted(runs, self.rows, side="right") - 1, max(float(np.std(self.u)), 1e-9)
         loose = [j for j, (_, _, rough) in enumerate(r.plant.values.values()) if rough]
         keys = [(i, n) for i, h in enumerate(effects) for n in h.numbers if n != "soft"]
         freed = {list(r.plant.values).index(h.site) for h in effects if h.effect == "parameter"}
@@ -276,14 +281,15 @@ class Judge:
         owner = np.searchsorted(self.at, self.rows, side="right") - 1
         weight = 1 / (r.tolerance * np.abs(r.stated[loose]))
 
-        def parts(z: Array) -> tuple[tuple[Hidden, ...], Array, Array]:
+        def parts(z: Array) -> tuple[tuple[Hidden, ...], Array, Array, Array | None]:
             numbers = [dict(h.numbers) for h in effects]
             for (i, n), s, v in zip(keys, sizes, z, strict=False):
                 numbers[i][n] = float(s * v)
             p, starts = r.true.copy(), self.x[self.at].copy()
             p[loose] = r.stated[loose] + z[len(keys) : len(keys) + len(loose)] / weight
-            starts += z[len(keys) + len(loose) :].reshape(-1, nx) * scale
-            return tuple(replace(h, numbers=m) for h, m in zip(effects, numbers, strict=True)), p, starts
+            starts += z[few : few + nx * len(self.at)].reshape(-1, nx) * scale
+            before = r.plant.middle + size * z[few + nx * len(self.at) :] if past else None
+            return tuple(replace(h, numbers=m) for h, m in zip(effects, numbers, strict=True)), p, starts, before
 
         def rest(z: Array) -> Array:
             with np.errstate(all="ignore"):
@@ -298,7 +304,7 @@ class Judge:
             return float((e**2).sum() + own @ own)
 
         few = len(keys) + len(loose)
-        z = np.concatenate([np.ones(len(keys)), (r.true - r.stated)[loose] * weight, np.zeros(len(self.at) * nx)])
+        z = np.concatenate([np.ones(len(keys)), (r.true - r.stated)[loose] * weight, np.zeros(len(self.at) * nx + len(runs))])
         e, damp = rest(z), 1e-6
         best = cost(e, z)
         for _ in range(steps):
@@ -307,8 +313,12 @@ class Judge:
                 J[..., j] = (rest(z + 1e-4 * (np.arange(len(z)) == j)) - e) / 1e-4
             for i in range(nx):
                 moved = z.copy()
-                moved[few + i :: nx] += 1e-4
+                moved[few + i : few + nx * len(self.at) : nx] += 1e-4
                 J[np.arange(len(e)), :, few + nx * owner + i] = (rest(moved) - e) / 1e-4
+            if past:
+                moved = z.copy()
+                moved[few + nx * len(self.at) :] += 1e-4
+                J[np.arange(len(e)), :, few + nx * len(self.at) + within] = (rest(moved) - e) / 1e-4
             A = J[:: self.thin].reshape(-1, len(z))
             own = np.zeros(len(z))
             own[len(keys) : few] = 1 / math.sqrt(self.thin)
@@ -335,7 +345,7 @@ class Judge:
     def stands(self, said: Sequence[Hidden], numbers: int) -> tuple[bool, float]:
         """(do other effects, refitted, fit as well as the truth, which has so many numbers?, the cost that they have more)."""
         spared = max(0, numbers - sum(len(h.numbers) for h in said))
-        excess = self.fit(said, 20)[0] - self.own
+        excess = self.fit(said, 40, True)[0] - self.own
         return excess <= SAME + spared * math.log(len(self.rows) * len(self.sigma)), excess
 
 
@@ -524,7 +534,11 @@ def _reached(case: Case, h: Hidden, at: Any, most: float, rng: np.random.Generat
 
 def _sized(case: Case, h: Hidden, at: Any, most: float, rng: np.random.Generator) -> Case:
     """As `_reached`, and larger where refitting would hide it."""
-    _, size = _reached(case, h, at, most, rng)
+    reached, size = _reached(case, h, at, most, rng)
+    if (
+        reached.strength > 2 * STRONGEST
+    ):  # it jumps with the size, as where a run begins: no size of it is one that was asked for
+        return replace(reached, label="hidden")
     while True:
         judge = Judge(case.rig, (Hidden(*h.key, at(size)),))
         strength, (_, paid, remains) = judge.strength(), judge.fit()

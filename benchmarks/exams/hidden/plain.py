@@ -135,28 +135,32 @@ def simulate(
     straight: bool,
     begins: Ints,
     starts: Array,
+    before: Array,
 ) -> tuple[Array, Array]:
     """(states, sensed outputs without noise) at the samples.
 
     u is written where a controller acts; law: its three gains, the middle and half the range of its input, its output or −1.
+    before: what was commanded before each run.
     """
     n, count, h = starts.shape[1], len(u), period / sub
     ny = len(S)
     X, Y, fine = np.zeros((count, n)), np.zeros((count, ny)), np.zeros((count * sub, ny))
     x, z, d, kept = np.zeros(n), np.zeros(n), np.zeros((4, n)), np.zeros(4)
-    memory, first, begun, total, last = np.zeros(4), 0, 0, 0.0, 0.0
+    memory, first, begun, total, last, run, old = np.zeros(4), 0, 0, 0.0, 0.0, 0, 0.0
     here, there = np.zeros(ny), np.zeros(ny)
     for k in range(count):
         if begins[k] > 0:
             x[:] = starts[begun]
             begun += 1
             if begins[k] == RUN:
-                memory[:], first, total = law[3], k, 0.0
-                memory[2] = abs(law[3])
+                old = before[run]
+                run += 1
+                memory[:], first, total = old, k, 0.0
+                memory[2] = abs(old)
         X[k] = x
         for j in range(sub):
             now = k * sub + j
-            held = commanded(u, first, sub, now - W[DELAY] / h, straight, law[3])
+            held = commanded(u, first, sub, now - W[DELAY] / h, straight, old)
             kept[:] = memory
             output(number, p, x, path(W, kept, held, 1e-9 * h), here)
             for i in range(ny):
@@ -181,7 +185,7 @@ def simulate(
                         total += law[1] * error * period
                     last = seen
             middle = 0.5 if straight else 0.0
-            a = path(W, memory, commanded(u, first, sub, now + middle - W[DELAY] / h, straight, law[3]), h)
+            a = path(W, memory, commanded(u, first, sub, now + middle - W[DELAY] / h, straight, old), h)
             t = (now - first * sub) * h
             z[:] = x
             for s in range(4):
@@ -503,19 +507,30 @@ class Rig:
         x, y = self._run(effects, self.true, u, noise, self.law, self.begins, self.starts)
         return x, y, u
 
-    def replay(self, effects: Sequence[Hidden], p: Array, u: Array, begins: Ints, starts: Array) -> Array:
-        """Outputs (T, ny) under recorded inputs."""
+    def replay(
+        self, effects: Sequence[Hidden], p: Array, u: Array, begins: Ints, starts: Array, before: Array | None = None
+    ) -> Array:
+        """Outputs (T, ny) under recorded inputs, and under what had been commanded before each run."""
         idle = np.array([0.0, 0, 0, self.plant.middle, 0, -1])
-        return self._run(effects, p, u.copy(), 0 * self.noise, idle, begins, starts)[1]
+        return self._run(effects, p, u.copy(), 0 * self.noise, idle, begins, starts, before)[1]
 
     def _run(
-        self, effects: Sequence[Hidden], p: Array, u: Array, noise: Array, law: Array, begins: Ints, starts: Array
+        self,
+        effects: Sequence[Hidden],
+        p: Array,
+        u: Array,
+        noise: Array,
+        law: Array,
+        begins: Ints,
+        starts: Array,
+        before: Array | None = None,
     ) -> tuple[Array, Array]:
         p, F, W, S = tables(self.plant, p, effects)
         sub = self.sub * (3 if F[:, DRY].any() else 1)
         seen = noise[:, max(int(law[5]), 0)]
         straight, number = self.hold == "first", NAMES.index(self.plant.name)
-        x, y = simulate(number, p, F, W, S, u, seen, self.reference, law, self.period, sub, straight, begins, starts)
+        before = np.full((begins == RUN).sum(), law[3]) if before is None else before
+        x, y = simulate(number, p, F, W, S, u, seen, self.reference, law, self.period, sub, straight, begins, starts, before)
         return x, y
 
 

@@ -419,14 +419,14 @@ def promising(h: Hypothesis, windows: Windows, thetas: Array, start: Array) -> t
     return best
 
 
-def slopes(fitted: Fit) -> Array:
-    """What moving each number of a fit by a step adds to the residual, (W, L·ny, p); 0 where that is not finite."""
+def slopes(fitted: Fit) -> tuple[Array, Array]:
+    """What moving each number of a fit by a step adds to the residual, (W, L·ny, p), 0 where not finite; and the steps (p,)."""
     h, p, windows = fitted.hypothesis, len(fitted.theta), fitted.windows
     step = _linearise(h, windows, fitted.theta, fitted.start).near(h)
-    thetas, starts, _ = nearby(h, fitted.theta, fitted.start, step)
+    thetas, starts, width = nearby(h, fitted.theta, fitted.start, step)
     r = _residual(h, windows, thetas[: 1 + p], starts[: 1 + p])
-    rows = (r[1:] - r[0]).reshape(p, len(windows), -1).transpose(1, 2, 0)
-    return np.asarray(np.where(np.isfinite(rows), np.clip(rows, -THRESHOLDS.steepest, THRESHOLDS.steepest), 0.0))
+    rows = (r[1:] - r[0]).reshape(p, len(windows), r[0].size // len(windows)).transpose(1, 2, 0)
+    return np.asarray(np.where(np.isfinite(rows), np.clip(rows, -THRESHOLDS.steepest, THRESHOLDS.steepest), 0.0)), width[:p]
 
 
 @final

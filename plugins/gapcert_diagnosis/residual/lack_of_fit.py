@@ -1,14 +1,15 @@
 """Does what a fit leaves go with anything along the path? Score tests of many small forces, each for itself and kind by kind.
 
-A force z at a coordinate adds a multiple of c = ∂y/∂z to the residual r. With c free of what starts and fitted numbers make,
-T = cᵀr has mean 0 and the variance of the noise along c unless the force is there: one direction shows what is too small for a
-test of all of r. Of the K forces of a kind together, with Q an orthonormal basis of their c, ‖Qᵀr‖² is the noise's variance
-times χ²(K): a law that no single one of them is like shows in their sum.
+A force z at a coordinate adds a multiple of c = ∂y/∂z to the residual r. With c free of what starts and fitted numbers make (as
+far as these may move: what is stated of them is measured, too), T = cᵀr has mean 0 and the variance of the noise along c unless
+the force is there: one direction shows what is too small for a test of all of r. Of the K forces of a kind together, with Q an
+orthonormal basis of their c, ‖Qᵀr‖² is the noise's variance times χ²(K): a law that no single one of them is like shows there.
 """
 
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -52,11 +53,15 @@ class Lack:
 
 def lack(long: Tangent, short: Tangent, seed: int = 0) -> Lack | None:
     """None where no score stands out; short: shows the colour of the noise."""
-    gone, shared = _absorbed(long), input_features(long)
-    r = _without(gone, long.project(long.residual).reshape(1, -1))
+    (gone, stated, r), shared = _absorbed(long), input_features(long)
     against = np.concatenate([long.linear.free, *(a.reshape(*long.residual.shape, -1) for a in (gone, r.T))], axis=2)
-    weighed = long.linear.adjoint(against)
-    drawn = functools.cache(lambda: [_without(gone, n.reshape(len(n), -1)) for n in noise(long, short, seed)])
+    weighed, rng = long.linear.adjoint(against), np.random.default_rng(seed)
+
+    @functools.cache
+    def drawn() -> list[Array]:
+        rows = (n.reshape(len(n), -1) for n in noise(long, short, seed))
+        return [_without(gone, n, rng.standard_normal((len(n), len(stated))) @ stated) for n in rows]
+
     best, clearly = Lack("", "", THRESHOLDS.lack_sigmas), attrgetter("sigmas")
     for site in long.model.sites("coordinate"):
         forces = _Forces.of(long, site, *weighed)
@@ -72,8 +77,9 @@ def lack(long: Tangent, short: Tangent, seed: int = 0) -> Lack | None:
     return Lack(best.site, KINDS.get(best.kind, best.kind), best.sigmas) if best.site else None
 
 
-def _without(gone: Array, rows: Array) -> Array:
-    return np.asarray(rows - (rows @ gone) @ gone.T)
+def _without(gone: Array, rows: Array, off: Array) -> Array:
+    """Rows (n, W·L·ny) without what numbers make; off (n, k): how far they are along each direction from what is stated."""
+    return np.asarray(rows - (rows @ gone + off) @ gone.T)
 
 
 @final
@@ -184,13 +190,28 @@ def rare(total: float, k: float) -> float:
     return float(-ndtri(max(float(chdtrc(k, total)), 1e-300)))
 
 
-def _absorbed(motion: Tangent) -> Array:
-    """An orthonormal basis (W·L·ny, k) of what the fitted numbers make, with the starts free to follow."""
-    rows = motion.project(slopes(motion.fitted)).reshape(motion.residual.size, -1)
+def _absorbed(motion: Tangent) -> tuple[Array, Array, Array]:
+    """An orthonormal basis of what the fitted numbers make, with the starts free to follow: of outputs (W·L·ny, k), and of what
+    is stated of the numbers (p, k), a measurement whose noise is a tolerance; the residual (1, W·L·ny) without it.
+
+    A fit leaves nothing of what it can make. What it leaves, two equal lags that would have to swing, or a number at its bound,
+    it cannot make.
+    """
+    h, (moved, step) = motion.fitted.hypothesis, slopes(motion.fitted)
+    # As in the fit: what is left is noise, and what is stated counts as much more.
+    weight, rows = (
+        math.sqrt(max(1.0, float(np.mean(motion.residual**2)))),
+        motion.project(moved).reshape(motion.residual.size, -1),
+    )
+    r, off = motion.project(motion.residual).reshape(1, -1), weight * (h.value - motion.fitted.theta) / h.sd
     if not rows.shape[1]:
-        return rows
+        return rows, np.empty((0, 0)), r
+    rows = np.concatenate([rows, np.diag(weight * step / h.sd)])
     u, size, _ = np.linalg.svd(rows / (np.linalg.norm(rows, axis=0) + 1e-300), full_matrices=False)
-    return np.asarray(u[:, size > THRESHOLDS.shared_direction * size[0]])
+    left = np.abs(np.append(r[0], off) @ u)
+    u = u[:, (size > THRESHOLDS.shared_direction * size[0]) & (left < THRESHOLDS.unmade * weight)]
+    gone, stated = u[: r.size], u[r.size :]
+    return gone, weight * stated, _without(gone, r, off @ stated)
 
 
 def _shapes(motion: Tangent, site: str) -> dict[str, Array]:

@@ -139,13 +139,13 @@ def input_features(motion: Tangent) -> dict[str, Array]:
 
 
 def _input_memory(motion: Tangent) -> Array:
-    u, drives, period = motion.u, motion.windows.measured.driven, motion.model.period
+    u, drives, repeat = motion.u, motion.windows.measured.driven, motion.windows.measured.repeat
     memory: list[Array] = []
     for lag in THRESHOLDS.input_lags:
-        slow = [_low_pass(d, period / lag) for d in drives]
-        sizes = [_low_pass(np.abs(d), period / lag) for d in drives]
+        slow = [_low_pass(d, 1 / (lag * repeat)) for d in drives]
+        sizes = [_low_pass(np.abs(d), 1 / (lag * repeat)) for d in drives]
         memory += [motion.gather(slow), motion.gather(sizes), u * motion.gather(sizes)]
-    memory += [motion.gather([_late(d, round(s / period)) for d in drives]) - u for s in THRESHOLDS.input_delays]
+    memory += [motion.gather([_late(d, round(s * repeat)) for d in drives]) - u for s in THRESHOLDS.input_delays]
     return np.concatenate(memory, axis=-1)
 
 

@@ -35,9 +35,8 @@ class Left:
     """The residual of a final model in long and short windows, and how it was judged.
 
     learnt: per coordinate; share: of the effort, the force that would leave as much; lack: what it goes with, though it may be
-    too little for the other tests, where something was fitted; shown: learnt per channel above its noise, of what its output
-    equation may lack; wide: the same in windows beyond the longest horizon, where what is slow adds up, if the first say
-    nothing against what was fitted.
+    too little for the other tests; shown: learnt per channel above its noise, of what its output equation may lack; wide: the
+    same in windows beyond the longest horizon, where what is slow adds up, if the first say nothing against what was fitted.
     """
 
     long: Tangent
@@ -72,10 +71,17 @@ class Left:
         return self.coherent and self.share > THRESHOLDS.slight_force
 
     @property
+    def hides(self) -> bool:
+        """Does it go with something, or grow beyond the horizon, and take more than an integrator leaves?"""
+        slight = self.share <= THRESHOLDS.slight_force
+        return not slight if self.lack is not None else self.wide is not None and (self.wide.remains or self.wide.hides)
+
+    @property
     def doubt(self) -> str | None:
         """Why what was fitted may be a stand-in, in words."""
-        if self.coherent and self.share > THRESHOLDS.faint_force:
-            best = self.best
+        best = self.best
+        # An integrator leaves a little that the present explains.
+        if self.coherent and (self.share > THRESHOLDS.faint_force or (best and best.memory > THRESHOLDS.learnt_share)):
             kind = max(best.kinds, key=lambda k: best.kinds[k]) if best and best.share > THRESHOLDS.learnt_share else None
             looks = f"; it looks like {KINDS.get(kind, kind)}" if kind else ""
             size = (
@@ -98,7 +104,7 @@ def left(model: Model, last: Fit, horizon: float = 0.0, seed: int = 0) -> Left:
     if found.remains and m.rough.any():
         smooth = _judged(_smoothed(long), _smoothed(short), seed)
         found = found if smooth.remains else smooth
-    if not last.hypothesis.charged or found.doubt is not None:
+    if found.doubt is not None:
         return found
     rooms = [len(y) - m.first(i) for i, y in enumerate(m.outputs)]
     length = round(THRESHOLDS.wide_window * max(m.samples(horizon), last.windows.length))
@@ -137,7 +143,7 @@ def _judged(long: Tangent, short: Tangent, seed: int) -> Left:
     found = Left(long, short, grown, learnt, share, shown=shown)
     if found.best in shown and found.coherent:
         found = replace(found, share=math.inf)  # no small force makes it
-    if not long.fitted.hypothesis.charged or (found.coherent and found.share > THRESHOLDS.faint_force):
+    if found.coherent and found.share > THRESHOLDS.faint_force:
         return found
     return replace(found, lack=lack(long, short, seed))
 
@@ -205,7 +211,8 @@ def verdict(
     if found.coherent and not last.windows.measured.exact and not near(THRESHOLDS.close_motion if helped else 0.0):
         return "unexplained"
     if not causes:
-        return "nothing"
+        silent = last.windows.measured.exact or not (found.hides or _astray(last) > THRESHOLDS.lack_sigmas)
+        return "nothing" if silent else "unexplained"
     return "ambiguous" if undecided else "causes"
 
 
