@@ -13,9 +13,9 @@ from gapcert.testing import multisine
 from gapcert_diagnosis.data.dataset import Dataset
 from gapcert_diagnosis.fitting.fit import fit, rescued
 from gapcert_diagnosis.residual import lack_of_fit as lackoffit
+from gapcert_diagnosis.residual import regression, whiteness
 from gapcert_diagnosis.residual import unexplained as leftover
-from gapcert_diagnosis.residual import whiteness
-from gapcert_diagnosis.residual.lack_of_fit import lack
+from gapcert_diagnosis.residual.lack_of_fit import Lack, lack
 from gapcert_diagnosis.residual.regression import features
 from gapcert_diagnosis.residual.unexplained import evidence
 from gapcert_diagnosis.search.candidates import Library
@@ -186,6 +186,20 @@ def test_causes_that_leave_something_are_doubted():
         assert leftover.verdict(causes, found, last, before, undecided, doubted, lambda share, near=close: near) == verdict
 
 
+def test_nothing_is_said_of_nothing_only():
+    found, last = left(recorded(truth()))
+    goes = replace(found, share=0.02, lack=Lack("q", "the time", 6.0))
+    off = replace(last, theta=last.theta + 8 * last.hypothesis.sd)
+    for one, numbers, verdict in (
+        (found, last, "nothing"),
+        (goes, last, "unexplained"),
+        (replace(goes, share=0.004), last, "nothing"),
+        (replace(found, wide=goes), last, "unexplained"),
+        (found, off, "unexplained"),
+    ):
+        assert leftover.verdict(0, one, numbers, last, undecided=False, doubted=False, near=lambda share: True) == verdict
+
+
 def test_what_long_rollouts_lose_counts_where_windows_are_nearly_noise():
     """A cause that leaves a third of what little windows show is the answer where rollouts lose most, and none where they do
     not, though they were close to the motion before."""
@@ -246,6 +260,52 @@ def test_parameters_that_a_stand_in_drags_along_doubt_it():
         doubts[c.site] = leftover.doubts(1, leftover.left(library.extended((c,), last.values), last), last)
     assert doubts["m"] == ()
     assert doubts["l"][-1].startswith("inadequate: parameters that are no cause have to be further")
+
+
+TANK = {
+    "kind": "equations",
+    "states": {"h": "m"},
+    "inputs": {"u": "m/s"},
+    "parameters": {"tau": {"value": "60 s", "tolerance": "3 %"}},
+    "derivative": {"h": "u - h/tau"},
+    "period": "2 s",
+}
+
+
+@pytest.mark.parametrize("late", [0.0, 5.0])
+def test_two_lags_that_stand_for_a_delay_are_doubted(monkeypatch, late):
+    """In a log of minutes memories are as long; and two equal lags seem to make what only two that swing could."""
+    model, rng = equations(TANK), np.random.default_rng(0)
+    u = np.repeat(rng.uniform(-1e-2, 1e-2, 120), 8)[:, None]
+    system = model.extend([Extension("hidden", "u", (Parameter("late", late, "s"),), delay="late")])
+    h = system.rollout(np.zeros((1, 1)), u[None, :-1]).x[0, :, 0] + 0.01 * rng.standard_normal(len(u))
+    recording = gc.Recording.of(2.0 * np.arange(len(u)), {"h": h, "u": u[:, 0]})
+    library = Library(model, Dataset.of(model, recording), [gc.registry().build("effect", "input-lag")])
+    (c,) = (c for c in library.candidates if len(library.names(c)) == 2)
+    last = fit(library.hypothesis((c,)), library.measured.windows(30), iterations=40)
+    found = leftover.left(library.extended((c,), last.values), last)
+    lacking = lack(found.long, found.short)
+    assert (lacking is not None) == (found.doubt is not None) == (late > 0)
+    if lacking is not None:
+        assert lacking.kind == lackoffit.KINDS["input memory"]
+        with monkeypatch.context() as patched:
+            patched.setattr(lackoffit, "THRESHOLDS", replace(lackoffit.THRESHOLDS, unmade=np.inf))
+            assert lack(found.long, found.short) is None
+
+
+def test_memories_of_an_input_are_as_long_whatever_the_unit_of_time():
+    made = []
+    for period in (0.01, 10.0):
+        section = {**TANK, "parameters": {"tau": f"{30 * period} s"}, "period": f"{period} s"}
+        model, rng = equations(section), np.random.default_rng(0)
+        u = rng.standard_normal(600)
+        h = model.rollout(np.zeros((1, 1)), u[None, :-1, None]).x[0, :, 0] / period
+        recording = gc.Recording.of(period * np.arange(600), {"h": h * period, "u": u})
+        library = Library(model, Dataset.of(model, recording), [])
+        last = fit(library.hypothesis(()), library.measured.at(np.array([[0, 100], [0, 300]]), 100))
+        made.append(regression.input_features(leftover.Tangent.of(library.extended((), {}), last)))
+    for kind, forces in made[0].items():
+        np.testing.assert_allclose(forces, made[1][kind], rtol=1e-6, atol=1e-9)
 
 
 def test_what_no_single_force_is_like_shows_in_a_kind(monkeypatch):
