@@ -74,6 +74,39 @@ def test_periods_are_as_short_as_a_held_input_asks_for():
 
 
 @pytest.mark.exam
+def test_a_limited_rate_is_seen_at_once_where_the_input_goes_straight():
+    """A damper's force follows its speed: half a period of a ramp is several floors of it."""
+    model = equations(
+        {
+            "kind": "equations",
+            "states": {"x": "m"},
+            "inputs": {"v": "m/s"},
+            "parameters": {"k": "6000 N/m", "c": {"value": "1080 N*s/m", "tolerance": "2 %"}},
+            "derivative": {"x": "v"},
+            "outputs": {"x": "x", "F": "k*x + c*v"},
+            "period": "5 ms",
+        }
+    )
+    t, fine, rng = np.arange(1600) * 0.005, np.arange(160_000) * 5e-5, np.random.default_rng(2)
+    v = 0.15 * np.sin(2 * np.pi * (0.5 * t + 0.4 * t**2))
+    asked, acts = np.interp(fine, t, v), np.zeros(len(fine))
+    for k in range(1, len(fine)):
+        acts[k] = acts[k - 1] + np.clip(asked[k] - acts[k - 1], -3.0 * 5e-5, 3.0 * 5e-5)
+    x = np.concatenate([[0.0], np.cumsum((acts[1:] + acts[:-1]) / 2) * 5e-5])
+    shown = {
+        "x": x[::100] + 1e-4 * rng.standard_normal(1600),
+        "F": (6000 * x + 1080 * acts)[::100] + 2 * rng.standard_normal(1600),
+    }
+    recording = gc.Recording.of(t, shown | {"v": v}, hold="first")
+    assert quickened(model, Dataset.of(model, recording).windows(100)).period < 2e-3
+    suspects = ["input-rate-limit", "input-lag", "input-gain", "input-saturation"]
+    found = diagnose(model, recording, suspects, horizons=[0.4])
+    (cause,) = found.causes
+    assert (cause.effect, cause.flags) == ("input-rate-limit", ())
+    assert cause.parameters["rate"].value == pytest.approx(3.0, rel=0.02)
+
+
+@pytest.mark.exam
 @pytest.mark.parametrize("name", ["sensor-delay", "input-lag"])
 def test_a_quarter_of_a_period_is_told_by_kind_and_size(name):
     u = levels(700)

@@ -98,24 +98,28 @@ def settled(model: Model, windows: Windows) -> tuple[Model, tuple[str, ...]]:
 
 
 def quickened(model: Model, windows: Windows) -> Model:
-    """A model whose periods are so short that what acts within one may be its mean, where inputs are known to be held.
+    """A model whose periods are so short that what acts within one may be its mean, where it is known how inputs are held.
 
-    They are halved until inputs that come half of one late move rollouts alike, as means and as they come.
+    They are halved until inputs that come half of one late move rollouts alike, as means and as they come; or, of inputs that
+    go straight from sample to sample, move no output that sees them at once.
     """
     m, part, repeat = windows.measured, windows.take(_few(windows)), windows.measured.repeat
     u = part.drive[:, m.past : m.past + (part.length - 1) * repeat]
-    still = np.zeros((len(part) * part.length, model.nu))
-    while m.hold == "zero" and repeat < THRESHOLDS.most_quickened * m.repeat:
+    sampled = part.u[:, m.history :]
+    change = np.diff(sampled, axis=1, prepend=sampled[:, :1])
+    while m.hold in ("zero", "first") and repeat < THRESHOLDS.most_quickened * m.repeat:
         finer = stepped(model, math.ceil(model.substeps / 2), model.period / 2)
         if finer is None:
             break
         twice = np.repeat(u, 2, axis=1)
         late = np.concatenate([u[:, :1], twice[:, :-1]], axis=1)
         means = late.reshape(*u.shape[:2], 2, -1).mean(axis=2)
+        sent = [(model, means), (finer, late)] if m.hold == "zero" else [(model, u)] * 2
+        shown = [0 * sampled] * 2 if m.hold == "zero" else [sampled, sampled - change / (2 * repeat)]
         with np.errstate(all="ignore"):
             own, other = (
-                one.output(flat(one.fast_rollout(part.start, sent, every=sent.shape[1] // (part.length - 1)).x), still)
-                for one, sent in ((model, means), (finer, late))
+                one.output(flat(one.fast_rollout(part.start, v, every=v.shape[1] // (part.length - 1)).x), flat(at))
+                for (one, v), at in zip(sent, shown, strict=True)
             )
             apart = difference(m.channels, own[:, m.columns], other[:, m.columns]) / m.sigma
             if not np.sqrt(np.mean(apart**2, axis=0)).max() > THRESHOLDS.mean_input:
