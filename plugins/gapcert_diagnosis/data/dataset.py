@@ -264,6 +264,15 @@ class Windows:
         """
         return self.take(np.arange(0, len(self), max(1, min(round(self.y.size / most), len(self) // fewest))))
 
+    def wide(self, horizon: float) -> Windows | None:
+        """Of the same data, well beyond these and a horizon in s, where what is slow adds up; None where they are too few."""
+        m, rooms = self.measured, [len(y) - self.measured.first(i) for i, y in enumerate(self.measured.outputs)]
+        length = round(THRESHOLDS.wide_window * max(m.samples(horizon), self.length))
+        length = min(length, max(rooms), sum(rooms) // THRESHOLDS.guard_windows)
+        if length < THRESHOLDS.longer_window * self.length:
+            return None
+        return m.windows(length).thinned(THRESHOLDS.fitted_values, THRESHOLDS.guard_windows)
+
     def with_hold(self, hold: Hold) -> Windows:
         """The same windows with the input held in a given way."""
         return replace(self, measured=replace(self.measured, hold=hold))

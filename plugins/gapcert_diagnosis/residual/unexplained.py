@@ -104,14 +104,9 @@ def left(model: Model, last: Fit, horizon: float = 0.0, seed: int = 0) -> Left:
     if found.remains and m.rough.any():
         smooth = _judged(_smoothed(long), _smoothed(short), seed)
         found = found if smooth.remains else smooth
-    if found.doubt is not None:
+    windows = None if found.doubt is not None else last.windows.wide(horizon)
+    if windows is None:
         return found
-    rooms = [len(y) - m.first(i) for i, y in enumerate(m.outputs)]
-    length = round(THRESHOLDS.wide_window * max(m.samples(horizon), last.windows.length))
-    length = min(length, max(rooms), sum(rooms) // THRESHOLDS.guard_windows)
-    if length < THRESHOLDS.longer_window * last.windows.length:
-        return found
-    windows = m.windows(length).thinned(THRESHOLDS.fitted_values, THRESHOLDS.guard_windows)
     wide = rescued(fit(last.hypothesis, windows, theta=last.theta))
     return replace(found, wide=_judged(*_tangents(model, wide), seed))
 
