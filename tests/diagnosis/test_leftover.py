@@ -259,7 +259,7 @@ def test_parameters_that_a_stand_in_drags_along_doubt_it():
         last = fit(library.hypothesis((c,)), library.measured.windows(120))
         doubts[c.site] = leftover.doubts(1, leftover.left(library.extended((c,), last.values), last), last)
     assert doubts["m"] == ()
-    assert doubts["l"][-1].startswith("inadequate: parameters that are no cause have to be further")
+    assert doubts["l"][-1].startswith("inadequate: parameters that are no cause lie further")
 
 
 TANK = {

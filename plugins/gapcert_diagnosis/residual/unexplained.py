@@ -216,7 +216,7 @@ def doubts(causes: int, found: Left, last: Fit, settings: int = 0) -> tuple[str,
     out = [found.doubt] if causes and found.doubt is not None else []
     if causes and (far := _astray(last)) > THRESHOLDS.astray_sigmas:
         out.append(
-            "inadequate: parameters that are no cause have to be further from what is stated than it is trusted "
+            "inadequate: parameters that are no cause lie further from what is stated than their tolerances make likely "
             f"({far:.2g} standard deviations)"
         )
     if causes - settings >= THRESHOLDS.several_causes:
