@@ -287,8 +287,8 @@ class Judge:
                 numbers[i][n] = float(s * v)
             p, starts = r.true.copy(), self.x[self.at].copy()
             p[loose] = r.stated[loose] + z[len(keys) : len(keys) + len(loose)] / weight
-            starts += z[few : few + nx * len(self.at)].reshape(-1, nx) * scale
-            before = r.plant.middle + size * z[few + nx * len(self.at) :] if past else None
+            starts += z[few:own_past].reshape(-1, nx) * scale
+            before = r.plant.middle + size * z[own_past:] if past else None
             return tuple(replace(h, numbers=m) for h, m in zip(effects, numbers, strict=True)), p, starts, before
 
         def rest(z: Array) -> Array:
@@ -304,7 +304,8 @@ class Judge:
             return float((e**2).sum() + own @ own)
 
         few = len(keys) + len(loose)
-        z = np.concatenate([np.ones(len(keys)), (r.true - r.stated)[loose] * weight, np.zeros(len(self.at) * nx + len(runs))])
+        own_past = few + nx * len(self.at)
+        z = np.concatenate([np.ones(len(keys)), (r.true - r.stated)[loose] * weight, np.zeros(own_past - few + len(runs))])
         e, damp = rest(z), 1e-6
         best = cost(e, z)
         for _ in range(steps):
@@ -313,12 +314,12 @@ class Judge:
                 J[..., j] = (rest(z + 1e-4 * (np.arange(len(z)) == j)) - e) / 1e-4
             for i in range(nx):
                 moved = z.copy()
-                moved[few + i : few + nx * len(self.at) : nx] += 1e-4
+                moved[few + i : own_past : nx] += 1e-4
                 J[np.arange(len(e)), :, few + nx * owner + i] = (rest(moved) - e) / 1e-4
             if past:
                 moved = z.copy()
-                moved[few + nx * len(self.at) :] += 1e-4
-                J[np.arange(len(e)), :, few + nx * len(self.at) + within] = (rest(moved) - e) / 1e-4
+                moved[own_past:] += 1e-4
+                J[np.arange(len(e)), :, own_past + within] = (rest(moved) - e) / 1e-4
             A = J[:: self.thin].reshape(-1, len(z))
             own = np.zeros(len(z))
             own[len(keys) : few] = 1 / math.sqrt(self.thin)

@@ -232,7 +232,7 @@ def test_a_direction_shows_what_is_too_little_for_other_tests(colour):
 
 @pytest.mark.parametrize("sag", [0.0, 0.2])
 def test_what_is_slow_shows_in_windows_beyond_the_horizon(sag):
-    """A gain that stands for a supply that sags within a second leaves noise in windows of 0.3 s."""
+    """The supply sags within a second. In windows of 0.3 s, another gain explains it and leaves only noise."""
     load = Memory("load", "N*m", "abs({u}) + (load - abs({u}))*exp(-{h}/lag)")
     numbers = (Parameter("lag", 1.0, "s"), Parameter("sag", sag, "1/(N*m)"))
     system = truth().extend([Extension("hidden", "u", numbers, input="{u}*(1 - sag*load)", memory=(load,))])
